@@ -545,7 +545,6 @@ code(
     "glTF of 100 000 nodes",
     texts(part__gltf=json.dumps(_NODES)),
     _LOAD_MESH.format(".gltf"),
-    expects="done",
 )
 code(
     "counts",

@@ -8,7 +8,7 @@ import torch
 
 from invertwin.capture import ChirpData, ChirpSettings
 from invertwin.channel import Grid
-from invertwin.checks import checked_tensor
+from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH, MAX_NUMBER
 from invertwin.links import Transmitters
@@ -106,3 +106,13 @@ def test_a_tensor_keeps_its_gradient_and_its_limit():
     assert checked_tensor(value, (2,), "numbers", "lower them", 3.0).requires_grad
     with pytest.raises(InputError, match=r"got 1 NaN, infinite or above 2 of 2; lower them"):
         checked_tensor(value, (2,), "numbers", "lower them", 2.0)
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**5_000)], ids=["400", "5000"])
+def test_integers_that_no_float_holds_are_one_line(number):
+    with pytest.raises(InputError, match=r"in \[0, 1\], got -?inf"):
+        checked_number(number, "a share", 0.0, 1.0)
+    with pytest.raises(InputError, match=r"integer in \[1, 100000000\], got -?inf"):
+        checked_count(number, "nodes", 1)
+    with pytest.raises(InputError, match="expected places as numbers"):
+        checked_tensor([10**400], (1,), "places", "give metres")

@@ -18,6 +18,8 @@ from invertwin.limits import MAX_LENGTH, MAX_NUMBER, AllowedValues, UsualValue, 
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
+MAX_COUNTED = 10**8
+"""Of what lies in memory, such as vertices and nodes."""
 Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
 _LIMITS: dict[type, tuple[str, str, Any]] = {
     Gt: ("gt", "above", operator.gt),
@@ -42,11 +44,7 @@ def checked_tensor(
     Raises:
         InputError: not numbers, wrong shape, NaN, infinite or too large.
     """
-    try:
-        tensor = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        expected = f"expected {what} as numbers of shape {_format_shape(shape)}"
-        raise InputError(f"{expected}, got {type(value).__name__}; {do}") from None
+    tensor = to_tensor(value, f"{what} as numbers of shape {_format_shape(shape)}", do)
     check_shape(refuse_batch(tensor), shape, f"{what} as numbers", do)
     bad = int((~(tensor.detach().abs() <= most)).sum())
     if bad:
@@ -55,6 +53,23 @@ def checked_tensor(
             f"{tensor.numel()}; {do}"
         )
     return tensor
+
+
+def to_tensor(value: object, what: str, do: str) -> Tensor:
+    """Convert a value to a float64 tensor of any shape; gradients are kept.
+
+    Args:
+        value: tensor, array or nested sequence of numbers.
+        what: what the value is, for the message.
+        do: what the user can do about it, for the message.
+
+    Raises:
+        InputError: not numbers.
+    """
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise InputError(f"expected {what}, got {type(value).__name__}; {do}") from None
 
 
 def checked_type(value: object, kind: type, what: str, do: str) -> None:
@@ -73,7 +88,9 @@ def checked_type(value: object, kind: type, what: str, do: str) -> None:
         raise InputError(f"expected {what} ({kind.__name__}), got {value!r:.80}; {do}")
 
 
-def check_choice(value: object, known: Collection[str], what: str, do: str = "choose one") -> None:
+def check_choice(
+    value: object, known: Collection[str | int], what: str, do: str = "choose one"
+) -> None:
     """Raise unless a value is one of some words.
 
     Args:
@@ -86,7 +103,7 @@ def check_choice(value: object, known: Collection[str], what: str, do: str = "ch
         InputError: another value.
     """
     if value not in known:
-        raise InputError(f"expected {what} {', '.join(known)}, got {value!r}; {do}")
+        raise InputError(f"expected {what} {', '.join(map(str, known))}, got {value!r}; {do}")
 
 
 def check_some(values: Sized, what: str, do: str) -> None:
@@ -115,7 +132,7 @@ def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> 
     Raises:
         InputError: wrong shape, NaN or infinite, or no point.
     """
-    rows = torch.as_tensor(value, dtype=torch.float64)
+    rows = to_tensor(value, f"{what} as numbers", do)
     rows = rows[None] if rows.ndim == 1 else rows
     rows = checked_tensor(rows, (None, 3), what, do, MAX_LENGTH)
     check_some(rows, f"row of {what}", do)
@@ -216,26 +233,30 @@ def checked_number(
         or (isinstance(bare, Tensor) and bare.ndim == 0 and not bare.is_complex())
     ):
         raise InputError(f"{expected}, got {type(value).__name__}; give one real number")
-    number = float(bare)
+    number = float(_cut_integer(bare))
     inside = low < number <= high if open_low else low <= number <= high
     if not (math.isfinite(number) and inside):
         raise InputError(f"{expected}, got {number:g}; give a value in that range")
     return number
 
 
-def checked_count(value: object, what: str, low: int) -> int:
-    """Convert a value to an integer that is at least `low`.
+def checked_count(value: Any, what: str, low: int, high: int = MAX_COUNTED) -> int:
+    """Convert a value to an integer in [low, high].
 
     Args:
         value: an integer.
         what: its name, for the error.
         low: least value.
+        high: greatest value.
 
     Raises:
-        InputError: not an integer, or too small.
+        InputError: not an integer, or out of range.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-        raise InputError(f"expected {what} as an integer >= {low}, got {value!r}; give a count")
+    value = _cut_integer(value)
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and low <= value <= high):
+        expected = f"expected {what} as an integer in [{low}, {high}]"
+        raise InputError(f"{expected}, got {value!r}; give a count in that range")
     return int(value)
 
 
@@ -256,11 +277,8 @@ def check_fields(holder: object) -> None:
         if not allowed:
             for number in value if isinstance(value, tuple) else (value,):
                 _check_number(holder, name, number, found)
-        elif value not in allowed:
-            raise InputError(
-                f"expected {name} to be one of {', '.join(map(str, allowed))}, got {value!r}; "
-                "choose one of them"
-            )
+        else:
+            check_choice(value, allowed, f"{name} to be one of", "choose one of them")
 
 
 @cache
@@ -286,20 +304,27 @@ def _check_number(holder: object, name: str, number: Any, found: tuple[Any, ...]
     do = f"correct {type(holder).__name__}({name}=...)"
     if usual is not None:
         do = f"give it in {usual.unit}, such as {usual.value:g}"
+    number = _cut_integer(number)
     if int in found and not isinstance(number, int | np.integer):
         raise InputError(f"expected {name} as an integer, got {number!r}; give a count")
-    if isinstance(number, bool) or not isinstance(number, int | float | np.number):
+    if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
         raise InputError(f"expected {name} as a number, got {number!r}; {do}")
     for mark in found:
         if type(mark) in _LIMITS:
             field, words, holds = _LIMITS[type(mark)]
             limit = getattr(mark, field)
-            finite = isinstance(number, int) or math.isfinite(number)
-            if not (finite and holds(number, limit)):
+            if not (math.isfinite(number) and holds(number, limit)):
                 raise InputError(f"expected {name} {words} {limit:g}, got {number}; {do}")
     if usual and not usual.low <= number <= usual.high:
         meant = usual.suggest_value(float(number))
         raise InputError(f"expected {name} in {usual.unit}, got {number:g}; did you mean {meant}?")
+
+
+def _cut_integer(value: Any) -> Any:
+    """Return ±∞ for an integer of hundreds of digits, which no float holds and no text shows."""
+    if isinstance(value, int) and abs(value) > 1e300:
+        return math.inf if value > 0 else -math.inf
+    return value
 
 
 def check_orthonormal(axes: Tensor, what: str, do: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cli.small import RUN
-from invertwin.cli.run_file import load_run, to_minimal_toml, validate_run
+from invertwin.cli.run_file import is_run_file, load_run, to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 
@@ -283,3 +283,18 @@ def test_what_is_stated_stays_apart_from_defaults():
         tomllib.loads(to_minimal_toml(read.model_copy(update={"seed": 5}))), Path("run.toml")
     )
     assert other.seed == 5
+
+
+def test_keys_of_thousands_of_parts_are_one_line(tmp_path):
+    path = tmp_path / "deep.toml"
+    path.write_text('task = "simulate"\nframe = 2\nradar' + ".a" * 5_000 + " = 1\n")
+    with pytest.raises(InputError, match=r"deep\.toml: ") as caught:
+        load_run(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_no_run_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert not is_run_file(tmp_path / "pipe.toml")  # and nothing waits for it
+    (tmp_path / "deep.toml").write_text("x = " + "[" * 20_000)
+    assert not is_run_file(tmp_path / "deep.toml")

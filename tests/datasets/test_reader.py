@@ -1,6 +1,7 @@
 """Samples come back as they were written, in any worker of a DataLoader."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -201,3 +202,12 @@ def test_a_damaged_shard_is_told(tmp_path):
     with pytest.raises(InputError) as told:
         found[9]
     assert "\n" not in str(told.value)
+
+
+def test_a_pipe_as_manifest_of_a_part_is_refused(tmp_path):
+    (tmp_path / "part_1").mkdir()
+    os.mkfifo(tmp_path / "part_1" / "manifest.json")
+    with pytest.raises(InputError, match="got a pipe or a device"):
+        SampleDataset(tmp_path)
+    with pytest.raises(InputError, match="the folder of a data set"):
+        SampleDataset(tmp_path / ("a" * 300))

@@ -226,7 +226,11 @@ def ply(vertex: str) -> str:
     ("name", "content", "message"),
     [
         ("missing.ply", None, "an existing file, got .*missing.ply"),
-        ("mesh.step", b"", r"mesh file \(.obj, .ply, .stl, .gltf, .glb, .inp\), got mesh.step"),
+        (
+            "mesh.step",
+            b"",
+            r"a mesh file of .obj, .*got '.step'; convert mesh.step",
+        ),
         ("empty.obj", b"", "empty.obj"),
         ("empty.stl", b"", "empty.stl"),
         ("empty.ply", b"", "empty.ply"),
@@ -238,6 +242,23 @@ def ply(vertex: str) -> str:
             "got 1 NaN, infinite or above 1e.09 of 9",
         ),
         ("nan.ply", ply("0 nan 0").encode(), "got 1 NaN, infinite or above 1e.09 of 9"),
+        (
+            "zero.obj",
+            b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 0/1 1/1 2/1\n",
+            "from 1.*got f 0/1 1/1",
+        ),
+        ("last.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 \\\r\n00\n", "got f 1 2 00"),
+        ("inset.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n f 1 3 2\n", "got  ?f 1 3 2"),
+        (
+            "relative.obj",
+            b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\nf -3 -2 -1\n",
+            "after all vertices, got f -3 -2 -1",
+        ),
+        (
+            "nodes.gltf",
+            b'{"nodes": [' + b'{"mesh": 0},' * 60_000 + b"{}]}",
+            "at most 50,000 groups or nodes",
+        ),
         ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
         ("index.ply", ply("0 0 0").replace("3 0 1 2", "3 0 1 7").encode(), "index.ply"),
         ("cut.ply", ply("0 0 0")[:150].encode(), "cut.ply"),

@@ -160,7 +160,7 @@ def test_any_text_is_closed(string, characteristic):
     [
         (lambda: plate(0.0, 1.0), r"plate width \[m\] in \(0, inf\), got 0"),
         (lambda: plate(1.0, math.nan), "plate height"),
-        (lambda: plate(1.0, 1.0, 0), "divisions as an integer >= 1, got 0"),
+        (lambda: plate(1.0, 1.0, 0), r"divisions as an integer in \[1, 100000000\], got 0"),
         (lambda: box(-1.0), "box size"),
         (lambda: box([1.0, 2.0]), r"box size as numbers of shape \[3\]"),
         (lambda: box([1.0, 2.0, 0.0]), "box size"),

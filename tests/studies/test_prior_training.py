@@ -95,7 +95,7 @@ def test_the_packaged_log_is_that_of_the_defaults():
         ({"rate": float("nan")}, r"expected rate in \(0, inf\), got nan"),
         ({"rate": -1.0}, r"expected rate in \(0, inf\), got -1"),
         ({"regularizer": float("nan")}, r"expected regularizer in \[0, inf\), got nan"),
-        ({"seed": -1}, "expected seed as an integer >= 0, got -1"),
+        ({"seed": -1}, r"expected seed as an integer in \[0, 9223372036854775807\], got -1"),
     ],
 )
 def test_settings_that_cannot_be_trained_are_refused(wrong, said):

@@ -61,8 +61,8 @@ class Camera:
             self.height, "height", 1
         )
         require_at_most(pixels, _MAX_PIXELS, "pixels", "bin them")
-        focal = torch.as_tensor(self.focal, dtype=torch.float64)
-        checks.checked_number(float(focal.detach()), "focal length [pixel]", 0.0, open_low=True)
+        focal = checks.checked_tensor(self.focal, (), "focal length [pixel]", "give one number")
+        checks.checked_number(focal, "focal length [pixel]", 0.0, open_low=True)
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)
         centre = middle if self.centre is None else self.centre
         centre = checks.checked_tensor(centre, (2,), "centre of an image [pixel]", "give u and v")

@@ -63,7 +63,7 @@ class ChirpSettings:
     frame_period: limits.Positive | None = None
     idle_time: IdleTime = 0.0
     adc_start_time: IdleTime = 0.0
-    ramp_end_time: float | None = None
+    ramp_end_time: limits.Positive | None = None
     real: bool = False
     swap_iq: bool = False
     bits: Annotated[int, limits.AllowedValues((12, 14, 16))] = 16

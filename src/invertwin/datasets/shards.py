@@ -155,11 +155,12 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
         InputError: None, a damaged one, or those of different data sets.
     """
     whole = folder / MANIFEST
-    files = [whole] if whole.is_file() else sorted(folder.glob(f"part_*/{MANIFEST}"))
+    with convert_read_errors(folder, "the folder of a data set"):
+        files = [whole] if whole.is_file() else sorted(folder.glob(f"part_*/{MANIFEST}"))
     found = []
     for file in files:
         with convert_read_errors(file, "the manifest of a data set"):
-            manifest = DatasetManifest.model_validate_json(file.read_bytes())
+            manifest = DatasetManifest.model_validate_json(existing_file(file).read_bytes())
         known = manifest.format in (FORMAT, OLD_FORMAT)
         known &= manifest.part[0] <= manifest.part[1]
         if not known or any(Path(s.name).name != s.name for s in manifest.shards):

@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from invertwin.checks import checked_type
 from invertwin.deprecation import warn_renamed
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
@@ -104,11 +105,8 @@ class Observation:
             sensor = data
             given: list[Any] = [*deprecated, *(weight, parameters, loss)[len(deprecated) - 1 :]]
             data, weight, parameters, loss = given
-        if not isinstance(model, ForwardModel):
-            raise InputError(
-                f"expected a forward model, got {type(model).__name__}; give one such as "
-                "SurrogateMap(grid), or derive a class from ForwardModel"
-            )
+        do = "give one such as SurrogateMap(grid), or derive a class from ForwardModel"
+        checked_type(model, ForwardModel, "a forward model", do)
         if sensor is _FROM_DATA:
             sensor = _sensor_of_recording(data, model)
         if not weight > 0:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.optimizer import Optimizer
@@ -86,11 +87,8 @@ def make_stages(
     kept = set(names)
     for number, stage in enumerate(stages):
         for name in stage.unknowns:
-            if name not in names:
-                raise InputError(
-                    f"expected names of parameters in stage {number + 1} ({', '.join(names)}), "
-                    f"got {name!r}; correct it"
-                )
+            what = f"names of parameters in stage {number + 1}:"
+            check_choice(name, names, what, "correct it")
         if number and stage.rebuilds_modules:
             kept = set(stage.unknowns or names)
         gone = [name for name in stage.unknowns if name not in kept]

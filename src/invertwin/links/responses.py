@@ -49,7 +49,7 @@ class AntennaMount:
 
     def __post_init__(self) -> None:
         do = "give the axes as columns, for all or for each place"
-        given = torch.as_tensor(self.rotations, dtype=torch.float64)
+        given = checks.to_tensor(self.rotations, "rotations of terminals", do)
         shape = (3, 3) if given.ndim < 3 else (None, 3, 3)
         turns = checks.checked_tensor(given, shape, "rotations of terminals", do)
         checks.check_orthonormal(turns, "rotations of terminals", do)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_rows, checked_tensor, set_fields
+from invertwin.checks import ArrayLike, checked_rows, checked_tensor, set_fields, to_tensor
 from invertwin.errors import InputError
 from invertwin.limits import Axes
 from invertwin.links.responses import AntennaMount
@@ -34,7 +34,7 @@ class Transmitters:
     def __post_init__(self) -> None:
         do = "give x, y, z, or a row of them for each"
         places = checked_rows(self.positions, "positions of transmitters [m]", do)
-        power = torch.as_tensor(self.power_dbm, dtype=torch.float64)
+        power = to_tensor(self.power_dbm, "powers of transmitters [dBm]", "give numbers")
         power = power.expand(len(places)) if power.ndim == 0 else power
         do = "give one for all, or one each"
         power = checked_tensor(power, (len(places),), "powers of transmitters [dBm]", do, 300.0)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from invertwin.checks import checked_count, checked_number
 from invertwin.errors import InputError
-from invertwin.limits import Axes, Count, Positive
+from invertwin.limits import MAX_LENGTH, Axes, Count, Positive
 from invertwin.radar.radar import Radar
 from invertwin.scene.parameters import Coordinate, RigidMotion, axes_mask, free_part
 
@@ -101,7 +101,8 @@ class RangeBias(nn.Module):
 
     def __init__(self, initial: float = 0.0) -> None:
         super().__init__()
-        self.bias = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
+        start = checked_number(initial, "range bias [m]", -MAX_LENGTH, MAX_LENGTH)
+        self.bias = nn.Parameter(torch.tensor(start, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
         """Return the radar with the bias added to its own."""
@@ -133,7 +134,8 @@ class ClockOffset(nn.Module):
         """
         super().__init__()
         self._positions = positions
-        self.shift = nn.Parameter(torch.tensor(initial, dtype=torch.float64))
+        start = checked_number(initial, "clock offset [s]", -1.0, 1.0)
+        self.shift = nn.Parameter(torch.tensor(start, dtype=torch.float64))
 
     def forward(self, radar: Radar) -> Radar:
         """Return the radar at its positions at the shifted times."""

@@ -18,7 +18,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from invertwin.checks import checked_tensor
+from invertwin.checks import check_choice, checked_tensor
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import shapes
@@ -41,7 +41,12 @@ _CORNERS = {"3": 3, "4": 4, "6": 3, "8": 4}  # corners of shell elements by the 
 Unit = Literal["m", "cm", "mm", "um", "in", "ft"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UCD_HEADER = re.compile(r"(#.*\n|\s)*(\d+\s+){4}\d+\s*\n")  # counts: nodes, cells, data
-_MAX_GROUPS, _MAX_BYTES = 10_000, 1e8  # of a file: two million triangles
+_MAX_SHAPES, _MAX_BYTES = 10_000, 1e8  # of a file: two million triangles
+#: What each group or node has, and how many there may be: trimesh takes long for them.
+_GROUPS = {".obj": (b"usemtl ", 10_000), ".gltf": (b'"mesh"', 50_000), ".glb": (b'"mesh"', 50_000)}
+_OBJ_LOST_LINE = re.compile(rb"^(?:[ \t]+[fv][ \t]|v\t).*$", re.M)
+_OBJ_CORNER_ZERO = re.compile(rb"^f[ \t](?:.*[ \t])?[+-]?0+(?:[/ \t].*)?$", re.M)
+_OBJ_RELATIVE_FACE = re.compile(rb"^f[ \t](?:.*[ \t])?-\d.*$", re.M)
 _LARGE = 100.0  # size of a suspicious mesh [m]
 CONCRETE = RoughDielectric(permittivity=5.24)
 """Default material of a scene file (ITU-R P.2040 concrete)."""
@@ -108,12 +113,8 @@ def _load_with(
     file: str | Path, unit: Unit, split: Callable[[trimesh.Scene], Mapping[str, trimesh.Trimesh]]
 ) -> dict[str, Mesh]:
     path = untrusted.existing_file(file)
-    if unit not in _METRES:
-        raise InputError(f"expected a unit among {', '.join(_METRES)}, got {unit!r}; choose one")
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(
-            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), got {path.name}; convert it first"
-        )
+    check_choice(unit, _METRES, "a unit among")
+    check_choice(path.suffix.lower(), MESH_SUFFIXES, "a mesh file of", f"convert {path.name} first")
     require_at_most(path.stat().st_size, _MAX_BYTES, "bytes of a mesh", "simplify it first")
     found = {}
     with untrusted.convert_read_errors(path, f"a readable {path.suffix} mesh"):
@@ -170,18 +171,11 @@ def save_mesh(path: str | Path, shape: Mesh | Scene) -> None:
         OSError: the file system refuses the write.
     """
     file = Path(path)
-    if file.suffix.lower() not in (".ply", ".glb"):
-        raise InputError(
-            f"expected a file name ending in .ply or .glb, got {file.name}; rename the output"
-        )
-    parts = (
-        {"mesh": (shape.vertices, shape.faces, None)}
-        if isinstance(shape, Mesh)
-        else {
-            name: (item.vertices, item.mesh.faces, item.material)
-            for name, item in shape.objects.items()
-        }
-    )
+    check_choice(file.suffix.lower(), (".ply", ".glb"), "a file name ending in", "rename it")
+    if isinstance(shape, Mesh):
+        parts = {"mesh": (shape.vertices, shape.faces, None)}
+    else:
+        parts = {k: (o.vertices, o.mesh.faces, o.material) for k, o in shape.objects.items()}
     looks = {id(material): _viewer_material(material) for *_, material in parts.values()}
     written = trimesh.Scene()
     glb = file.suffix.lower() in _Y_UP
@@ -219,7 +213,7 @@ def load_scene_xml(
     file = untrusted.existing_file(path)
     with untrusted.convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
-        require_at_most(len(root), _MAX_GROUPS, "shapes", "join those of one material")
+        require_at_most(len(root), _MAX_SHAPES, "shapes", "join those of one material")
     try:
         return _build_scene(root, file, dict(materials or {}), default)
     except InputError as error:
@@ -241,8 +235,7 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
         OSError: the write fails.
     """
     file = Path(path)
-    if file.suffix.lower() != ".xml":
-        raise InputError(f"expected a file name ending in .xml, got {file.name}; rename the output")
+    check_choice(file.suffix.lower(), (".xml",), "a file name ending in", "rename the output")
     root = ElementTree.Element("scene", version="2.1.0")
     names: dict[int, str] = {}
     shapes = []
@@ -276,15 +269,26 @@ class _FileResolver(FilePathResolver):
 
 
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
-    if path.suffix.lower() == ".obj":
-        # Trimesh takes a time that grows with the square of their number.
-        groups = path.read_bytes().count(b"usemtl ")
-        require_at_most(groups, _MAX_GROUPS, "groups of a material", "join groups of one material")
-    if path.suffix.lower() != ".inp":
+    suffix, data = path.suffix.lower(), path.read_bytes()
+    mark, most = _GROUPS.get(suffix, (b"\n", math.inf))
+    require_at_most(data.count(mark), most, "groups or nodes", "join those of one material")
+    if suffix == ".obj":
+        _check_obj(data.replace(b"\r", b"").replace(b"\\\n", b""))
+    if suffix != ".inp":
         return trimesh.load_scene(path, process=False, resolver=_FileResolver(str(path)))
     text = untrusted.read_text(path, "an .inp mesh")
     vertices, faces = _ucd(text) if _UCD_HEADER.match(text) else _abaqus(text)
     return trimesh.Scene(trimesh.Trimesh(vertices, faces, process=False))
+
+
+def _check_obj(data: bytes) -> None:
+    """Raise for faces that trimesh leaves out, or reads as other corners than the file means."""
+    found = _OBJ_LOST_LINE.search(data) or _OBJ_CORNER_ZERO.search(data)
+    if found := found or _OBJ_RELATIVE_FACE.search(data, 0, max(data.rfind(b"\nv "), 0)):
+        raise InputError(
+            "expected lines that begin with 'v ' or 'f ', and corners from 1, or −1 after all "
+            f"vertices, got {found[0].decode(errors='replace'):.60}; export the mesh again"
+        )
 
 
 def _ucd(text: str) -> tuple[np.ndarray, np.ndarray]:
@@ -381,16 +385,12 @@ def _ply(mesh: trimesh.Trimesh) -> bytes:
     faces = np.empty(len(mesh.faces), dtype=[("count", "<u1"), ("index", "<i4", 3)])
     faces["count"] = 3
     faces["index"] = mesh.faces
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    places = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{places}"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return header.encode() + vertices.tobytes() + faces.tobytes()
 
 
 def _build_scene(

@@ -245,7 +245,7 @@ def _leakage(value: complex | checks.ArrayLike, elements: int) -> Tensor:
     do = "give the field of the other polarisation over the wanted one, of all elements or of each"
     try:
         found = torch.as_tensor(value, dtype=torch.complex128)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"expected leakage as numbers, got {value!r}; {do}") from None
     parts = torch.view_as_real(found)
     if found.shape not in ((), (elements,)) or not bool(torch.isfinite(parts).all()):

@@ -49,7 +49,7 @@ class AccessGuard:
             for family, kind, protocol, _, address in found[:1]:
                 with socket.socket(family, kind, protocol) as probe:
                     probe.bind(address)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise InputError(
                 f"expected an address of this machine as host, got {host!r} ({error}); "
                 "use 127.0.0.1"

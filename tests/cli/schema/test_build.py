@@ -343,7 +343,7 @@ def test_a_room_may_be_all_that_there_is():
         ({"room": {"furniture": ["piano"]}}, r"room: expected furniture among table"),
         (
             {"room": {"furniture": [], "materials": {"sofa": ROUGH}}},
-            r"room\.materials\.sofa: expected an object of the room \(floor, ",
+            r"room\.materials\.sofa: expected an object of the room: floor, ",
         ),
         ({"room": {}, "truth": {"sofia": {}}}, r"truth\.sofia: .*mean `sofa`"),
         ({"room": {}, "scene": {"sofa": make_box()}}, r"scene\.sofa: .*choose another"),

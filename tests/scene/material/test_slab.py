@@ -364,7 +364,7 @@ def test_power_is_kept_at_the_ends(permittivity, conductivity, thickness):
         (lambda: slab_coefficients([], torch.ones(1).double(), 1e9), "at least one layer"),
         (
             lambda: slab_coefficients([Layer(2.0, thickness=0.01)], torch.ones(1).double(), 1e9),  # pyright: ignore[reportArgumentType]
-            "layers at a frequency, got Layer",
+            r"layers at a frequency \(SlabLayer\), got Layer",
         ),
         (lambda: Slab(2.0, thickness=0.01).scattering_law(-1.0), "frequency"),
         (lambda: Slab(Itu("concrete"), thickness=Itu("concrete")), "thickness"),  # pyright: ignore[reportArgumentType]

@@ -225,7 +225,7 @@ def test_bad_input():
     broken.value.data[2, 2, 2] = torch.nan
     with pytest.raises(InputError, match="expected a finite field"):
         broken(SCENE)
-    with pytest.raises(InputError, match="integer >= 2, got 1"):
+    with pytest.raises(InputError, match=r"integer in \[2, 100000000\], got 1"):
         DistanceGrid("ball", LOW, HIGH, torch.ones(4, 1, 4, dtype=torch.float64))
     with pytest.raises(InputError, match="radius"):
         NeuralDistance("ball", LOW, HIGH, [9] * 3, radius=0.0)

@@ -62,7 +62,7 @@ class Training:
             checked_count(getattr(self, name), name, 1)
         checked_number(self.rate, "rate", 0.0, open_low=True)
         checked_number(self.regularizer, "regularizer", 0.0)
-        checked_count(self.seed, "seed", 0)
+        checked_count(self.seed, "seed", 0, 2**63 - 1)
         if self.cars <= max(self.latent, self.features):
             raise InputError(
                 f"expected more cars than {max(self.latent, self.features)} coordinates and "

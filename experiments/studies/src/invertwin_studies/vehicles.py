@@ -253,7 +253,7 @@ def sample_car(seed: int, kind: str | None = None) -> Car:
     """
     if kind is not None and kind not in KINDS:
         raise InputError(f"expected a kind of car ({', '.join(KINDS)}), got {kind!r}; choose one")
-    random = np.random.default_rng(checked_count(seed, "seed", 0))
+    random = np.random.default_rng(checked_count(seed, "seed", 0, 2**63 - 1))
     drawn = str(random.choice(list(KINDS), p=_SHARES))
     ranges = {**_COMMON, **KINDS[drawn if kind is None else kind]}
     value = {name: float(random.uniform(*ranges[name])) for name in sorted(ranges)}

@@ -15,7 +15,7 @@ import tomli_w
 import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
-from invertwin.checks import checked_tensor
+from invertwin.checks import check_choice, checked_tensor
 from invertwin.constants import FRAME, OLD_AXES
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
@@ -276,10 +276,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
     """
     untrusted.existing_file(path, "the data file that [data] names")
     ending = path.suffix.lower()
-    if ending not in _SUFFIXES:
-        raise InputError(
-            f"expected a file that ends in {', '.join(_SUFFIXES)}, got {path.name}; convert it"
-        )
+    check_choice(ending, _SUFFIXES, "a file that ends in", f"convert {path.name}")
     require_memory(3.0 * path.stat().st_size, f"the samples of {path.name}", "split the file")
     if ending != ".npy" and variable is None:
         raise InputError(f"expected a variable in {path.name}, got none; add it to [data]")

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator
 from torch import Tensor, nn
 
 from invertwin import scene as scenes
-from invertwin.checks import ArrayLike, Point
+from invertwin.checks import ArrayLike, Point, check_choice
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
@@ -88,14 +88,9 @@ class RoomTable(ConstructorTable):
         found: dict[str, scenes.Object] = super().build(given, **more)
         for name, table in self.materials.items():
             with prefix_errors(f"materials.{name}"):
-                if name not in found:
-                    raise InputError(
-                        f"expected an object of the room ({', '.join(found)}), got none of this "
-                        "name; correct it"
-                    )
-                found[name] = replace(
-                    found[name], material=table.build({scenes.Mesh: found[name].mesh})
-                )
+                check_choice(name, found, "an object of the room:", "correct it")
+                own = table.build({scenes.Mesh: found[name].mesh})
+                found[name] = replace(found[name], material=own)
         return found
 
 

@@ -70,7 +70,7 @@ class Metasurface:
         do = "give one for each element, along y and z"
         phase = checks.checked_tensor(self.phase, (None, None), f"phases {what} [rad]", do)
         checks.check_some(phase.ravel(), f"element {what}", do)
-        amplitude = torch.as_tensor(self.amplitude, dtype=torch.float64)
+        amplitude = checks.to_tensor(self.amplitude, "amplitudes", "give numbers")
         amplitude = amplitude.expand(phase.shape) if amplitude.ndim == 0 else amplitude
         do = "give one, or one for each"
         amplitude = checks.checked_tensor(amplitude, tuple(phase.shape), f"amplitudes {what}", do)

@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface.panel import Metasurface
 
 _CORNERS_ADVICE = "give x, y of at least two corners, the room on the left"
+_MAX_ELEMENTS = 10_000  # of a panel along an axis
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
@@ -179,7 +180,7 @@ class PanelPlacement(nn.Module):
         widths = checked_tensor(spread, (2,), "spread of a beam [rad]", "give two half widths")
         self.spread = nn.Parameter(widths.clone())
         if counts is not None:
-            self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
+            self.shift = _zero_phases(counts)
 
     def forward(self, panel: Metasurface) -> Metasurface:
         """The panel where it stands, with its phases."""
@@ -207,6 +208,11 @@ class PanelPlacement(nn.Module):
         return {f"panel.{name}": value.detach().clone() for name, value in named.items()}
 
 
+def _zero_phases(counts: Sequence[int]) -> nn.Parameter:
+    sizes = [checked_count(count, "elements along y and z", 1, _MAX_ELEMENTS) for count in counts]
+    return nn.Parameter(torch.zeros(sizes, dtype=torch.float64))
+
+
 class ElementPhases(nn.Module):
     """A module Metasurface → Metasurface that adds a phase to each element.
 
@@ -219,7 +225,7 @@ class ElementPhases(nn.Module):
 
     def __init__(self, counts: Sequence[int]) -> None:
         super().__init__()
-        self.shift = nn.Parameter(torch.zeros(*counts, dtype=torch.float64))
+        self.shift = _zero_phases(counts)
 
     def forward(self, panel: Metasurface) -> Metasurface:
         """The panel with its phases shifted."""

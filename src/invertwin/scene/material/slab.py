@@ -30,6 +30,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.checks import checked_type
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
@@ -158,10 +159,7 @@ def _both_polarisations(
     if not layers:
         raise InputError("expected at least one layer, got none; give the layers of the slab")
     for layer in layers:
-        if not isinstance(layer, SlabLayer):
-            raise InputError(
-                f"expected layers at a frequency, got {type(layer).__name__}; give layer.sheet(f)"
-            )
+        checked_type(layer, SlabLayer, "layers at a frequency", "give layer.sheet(f)")
     cosine = cos_theta.clamp(min=LEAST_COSINE)
     s, p = (_response(layers, cosine, frequency, parallel=parallel) for parallel in (False, True))
     return s, p

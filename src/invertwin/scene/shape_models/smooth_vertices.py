@@ -18,6 +18,8 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.parameters import ObjectModule
 from invertwin.scene.shape_models.lattice import Lattice, tensor_product
 
+_MAX_SMOOTHING = 1e9  # √λ is a number of edges; the matrix of much more has no factors
+
 
 class LatticeDeformation(ObjectModule):
     """Deform an object by cubic B-splines over a lattice of control points.
@@ -104,7 +106,7 @@ class SmoothVertices(ObjectModule):
 
     def __init__(self, object: str, mesh: Mesh, smoothing: float = 20.0) -> None:
         super().__init__(object)
-        amount = checked_number(smoothing, "smoothing λ", 0.0)
+        amount = checked_number(smoothing, "smoothing λ", 0.0, _MAX_SMOOTHING)
         count = len(mesh.vertices)
         self._faces = mesh.faces.clone()
         self._smoother = Smoother(mesh.faces, count, amount)
