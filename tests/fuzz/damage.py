@@ -8,6 +8,7 @@ import io
 import json
 import re
 import tomllib
+import zipfile
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,8 @@ from hypothesis import strategies as st
 Files = dict[str, bytes]
 SOUND = "sound"
 """Name of an empty file beside damaged ones that the libraries of their formats wrote."""
+SPECIAL = (b"a pipe", b"a device", b"a folder", b"a loop", b"holes")
+"""In place of a file's bytes: something else than a file, or one that takes no disk."""
 _WORD = re.compile(rb"[^\s,=:\[\]{}()<>]+")
 _MOST = 1 << 20  # bytes of a damaged file
 #: Of a value that is valid nearly everywhere, and of one that is valid hardly anywhere.
@@ -33,7 +36,7 @@ TEXTS: tuple[str, ...] = (
     *("", " ", "x", "nan", "-1", "1e999", "0x", "0xFFFFFFFFFF", "9" * 5_000, "a" * 5_000),
     *("\0", "a\0b", "\x1b[31m", "line\nline", "$\\frac$", "<script>", "{0}", "%s", "\u202e"),
     *("ü" * 300, ".", "..", "../victim", "link/victim", "/", "/dev/zero", "/etc/passwd", "~"),
-    *("C:\\x.bin", "http://x.invalid/"),
+    *("C:\\x.bin", "http://x.invalid/", "a" * 100_000, ".a" * 5_000, "ü\n" * 10_000),
 )
 OTHERS: tuple[Any, ...] = (None, True, False, [], {}, [[]], [None], {"": None}, [0] * 1_000)
 HOSTILE = NUMBERS + TEXTS + OTHERS
@@ -65,7 +68,7 @@ def damaged(samples: list[Files], edits: Edits, levels: tuple[str, ...]) -> File
     Args:
         samples: Valid files by name.
         edits: What is done.
-        levels: Of "bytes", "words" and "values": which kinds of damage are done.
+        levels: Of "bytes", "words", "values" and "special": which kinds of damage are done.
     """
     files = dict(samples[edits[0] % len(samples)])
     # The first file is the one that is read: it gets half of the damage.
@@ -73,8 +76,9 @@ def damaged(samples: list[Files], edits: Edits, levels: tuple[str, ...]) -> File
     name = names[edits[1] % len(names)]
     chosen = [levels[edit.level % len(levels)] for edit in edits[2]]
     for level, edit in zip(chosen, edits[2], strict=True):
-        files[name] = _LEVELS[level](name, files[name], edit)[:_MOST]
-    return files | ({} if "bytes" in chosen else {SOUND: b""})
+        if files[name] not in SPECIAL:  # nothing is done to what is no file
+            files[name] = _LEVELS[level](name, files[name], edit)[:_MOST]
+    return files | ({} if {"bytes", "special"} & {*chosen} else {SOUND: b""})
 
 
 def _values(name: str, data: bytes, edit: Edit) -> bytes:
@@ -280,7 +284,44 @@ def _bytes(_name: str, data: bytes, edit: Edit) -> bytes:
             return data[:at] + edit.more.to_bytes(4, "little") * (1 + edit.more % 9) + data[at:]
 
 
-_LEVELS = {"bytes": _bytes, "words": _words, "values": _values}
+def _special(name: str, data: bytes, edit: Edit) -> bytes:
+    """Put something else than a file in its place, or one that expands or has many of a thing."""
+    if edit.kind % 2:
+        return SPECIAL[edit.more % len(SPECIAL)]
+    if data.startswith(b"PK"):
+        try:
+            return _expanding(data, edit)
+        except Exception:  # an archive that is damaged already
+            return data
+    return _many(name, data, edit)
+
+
+def _expanding(data: bytes, edit: Edit) -> bytes:
+    """An archive one member of which becomes zeros: a thousandth of what it says it holds."""
+    new, (old, count) = io.BytesIO(), (zipfile.ZipFile(io.BytesIO(data)), 1 << (20 + edit.more % 9))
+    names = old.namelist()
+    with zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number, name in enumerate(names):
+            kept = old.read(name)
+            if number == edit.place % len(names):
+                kept = kept[:128].replace(b"(3,", b"(%d," % (count // 24)) + bytes(count)
+            archive.writestr(name, kept)
+    return new.getvalue()
+
+
+def _many(name: str, data: bytes, edit: Edit) -> bytes:
+    """A text one line of which is there ten thousand times, or has ten thousand of its words."""
+    lines = data[:_MOST].split(b"\n")
+    at = edit.place % len(lines)
+    count = min(1 + edit.more % 10_000, 1 + _MOST // (1 + len(lines[at])))
+    if edit.more % 2:
+        lines[at] = b" ".join([lines[at]] * count)
+    else:
+        lines[at : at + 1] = [lines[at]] * count
+    return b"\n".join(lines)
+
+
+_LEVELS = {"special": _special, "bytes": _bytes, "words": _words, "values": _values}
 
 
 def _npz(data: bytes) -> dict[str, Any]:

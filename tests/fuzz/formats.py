@@ -55,7 +55,7 @@ from invertwin.viewer import (
 )
 from invertwin.viewer.guard import is_valid_message
 
-ALL = ("bytes", "words", "values")
+ALL = ("bytes", "words", "values", "special")
 
 
 @dataclass(frozen=True)
@@ -587,17 +587,23 @@ def _read_request(data: bytes) -> None:
 
 
 FORMATS: dict[str, Format] = {
-    "run_file": Format(_runs, _read_run, ("words", "values", "values")),
+    "run_file": Format(_runs, _read_run, ("words", "values", "values", "special")),
     "mesh": Format(_meshes, _read_mesh),
-    "capture": Format(_captures, _read_capture, ("bytes", "values", "values", "values"), short=30),
-    "npz": Format(_npz, _read_npz, ("bytes", "values")),
-    "mat": Format(_mats, _read_arrays, ("bytes", "values", "values", "values"), short=30),
+    "capture": Format(
+        _captures, _read_capture, ("bytes", "values", "values", "values", "special"), short=30
+    ),
+    "npz": Format(_npz, _read_npz, ("bytes", "values", "special")),
+    "mat": Format(
+        _mats, _read_arrays, ("bytes", "values", "values", "values", "special"), short=30
+    ),
     "sweeps": Format(_sweeps, _read_sweeps),
     "dca1000": Format(_boards, _read_board),
     "channels": Format(_channels, ChannelCalibration.load),
-    "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values")),
-    "view": Format(_views, _read_view, ("bytes", "values", "values")),
-    "data_set": Format(_data_sets, _read_data_set, ("bytes", "values", "values")),
-    "message": Format(_messages, _read_message),
-    "manifest": Format(_manifests, _read_manifest, intact=("victim", "notes.txt")),
+    "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values", "special")),
+    "view": Format(_views, _read_view, ("bytes", "values", "values", "special")),
+    "data_set": Format(_data_sets, _read_data_set, ("bytes", "values", "values", "special")),
+    "message": Format(_messages, _read_message, ("bytes", "words", "values")),
+    "manifest": Format(
+        _manifests, _read_manifest, ("bytes", "words", "values"), intact=("victim", "notes.txt")
+    ),
 }
