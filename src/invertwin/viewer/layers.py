@@ -119,11 +119,11 @@ def radar_layers(
         ends = places[k] + rays @ axes[k].T
         sides = torch.stack([places[k].expand(4, 3), ends], dim=1)
         lines += [sides.reshape(-1, 3), torch.stack([ends, ends.roll(-1, 0)], 1).reshape(-1, 3)]
-    of = f"/{name}" if name else ""
+    of, is_alone = f"/{name}" if name else "", not name and len(places) == 1
     beams, boards = to_float32(torch.cat(lines)), to_float32(corners.reshape(-1, 3))
     return [
         DisplayLayer(f"radar{of}", "points", to_float32(places), color=ROLES["radar"]),
-        DisplayLayer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=len(chosen) == 1),
+        DisplayLayer(f"beams{of}", "lines", beams, color=(150, 150, 160), shown=is_alone),
         DisplayLayer(f"boards{of}", "surface", boards, to_int32(faces), ROLES["radar"]),
     ]
 
