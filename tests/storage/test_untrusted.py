@@ -148,6 +148,7 @@ def test_warnings_that_are_errors_stay_warnings():
         # What `make fuzz` has found.
         ("a.setup.json", '{"configUsed": "b.json", "DCA1000Config": "x"}', read_studio),
         ("a.setup.json", json.dumps({"configUsed": "b" * 5_000}), read_studio),
+        ("a.setup.json", '{"configUsed": "b.json", "DCA1000Config": 1.5}', read_studio),
         (
             "a.toml",
             DESCRIPTION.format("q.npy").replace("[data]", "[data]\ndimensions = [[]]"),
@@ -179,6 +180,9 @@ def test_errors_of_readers_name_the_file_and_pass_input_errors_on():
         ("len.no_such_attribute", AttributeError),
         ("'a value of JSON'.get('key')", None),
         ("None.get('key')", None),
+        ("from decimal import Decimal; Decimal('1.5').get('key')", None),
+        ("from datetime import date; date(2026, 1, 1).get('key')", None),
+        ("import numpy; numpy.zeros(2).split('/')", None),
         ("import no_such_module", ImportError),
         ("def f():\n  x += 1\nf()", UnboundLocalError),
         ("assert not 1", AssertionError),

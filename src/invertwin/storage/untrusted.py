@@ -22,6 +22,7 @@ _R = TypeVar("_R")
 _MAX_EXPANDED, _MAX_EXPANSION = 2**28, 100
 _MAX_TEXT = 2**28  # bytes
 _PLAIN = (str, bytes, int, float, list, dict, type(None))
+_PLAIN_MODULES = ("decimal", "datetime", "numpy")
 _OWN_FAULTS = (NameError, AttributeError, ImportError, NotImplementedError, AssertionError)
 _DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
@@ -56,7 +57,8 @@ def convert_read_errors(
 
 def _is_own_fault(error: Exception) -> bool:
     """Return True for what a line of this package itself raises, and no content can cause."""
-    plain = isinstance(getattr(error, "obj", error), _PLAIN)  # a value of JSON, not of its kind
+    value = getattr(error, "obj", error)  # of a file, and of another kind than it should be
+    plain = isinstance(value, _PLAIN) or type(value).__module__ in _PLAIN_MODULES
     if plain or not isinstance(error, _OWN_FAULTS):
         return False
     *_, (frame, _) = walk_tb(error.__traceback__)
