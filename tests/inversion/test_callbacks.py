@@ -4,6 +4,8 @@ import math
 import os
 import subprocess
 import sys
+import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -257,3 +259,23 @@ def test_what_no_optimizer_has_left_is_not_taken_for_its_state(name, value):
     state["state"][0][name] = value
     with pytest.raises(ValueError, match="optimiser of another fit"):
         _restore_optimizer(torch.optim.Adam([parameter]), state)
+
+
+def test_a_checkpoint_with_a_name_of_a_million_letters_is_refused_at_once(case, tmp_path):
+    """torch's own message about it takes minutes: it searches it for patterns."""
+    file = tmp_path / "fit.pt"
+    name = b"c" + b"a" * 1_000_000 + b"\n" + b"b\n"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02" + name + b".")
+        archive.writestr("archive/version", "3\n")
+    begin = time.process_time()
+    with pytest.raises(InputError, match="expected a whole checkpoint, got"):
+        reconstruct(
+            case.scene,
+            Observation(SurrogateMap(case.grid, sampling=FEW), case.capture),
+            Vertices("plate", 4),
+            schedule=Schedule(1),
+            callbacks=[Checkpoint(file, resume=True)],
+            seed=1,
+        )
+    assert time.process_time() - begin < 20

@@ -194,7 +194,7 @@ def test_a_model_of_ones_own_derives_from_forward_model(unchecked):
         def observe(self, recording: Any) -> Tensor:
             return torch.zeros(1)
 
-    with pytest.raises(InputError, match=r"got Looks; .*derive a class from ForwardModel"):
+    with pytest.raises(InputError, match=r"got <.*; give one .*derive a class from ForwardModel"):
         Observation(Looks(), None)  # type: ignore[arg-type]
 
 

@@ -144,7 +144,7 @@ def test_steps_alone_may_come_without_a_name(part):
     ("stages", "message"),
     [
         ([], "at least one stage, got none"),
-        ([Stage(1, unknowns=("shape",))], r"stage 1 \(place, size\), got 'shape'"),
+        ([Stage(1, unknowns=("shape",))], "stage 1: place, size, got 'shape'"),
         (
             [
                 Stage(1, unknowns=("size",)),

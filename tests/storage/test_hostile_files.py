@@ -71,7 +71,7 @@ def test_a_mesh_whose_materials_are_a_pipe_is_read(tmp_path):
 def test_groups_of_materials_are_counted_first(tmp_path):
     groups = "".join(f"usemtl x{k}\nf 1 2 3\n" for k in range(10_001))
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + groups)
-    with pytest.raises(InputError, match="at most 10,000 groups of a material"):
+    with pytest.raises(InputError, match="at most 10,000 groups or nodes"):
         load_mesh(tmp_path / "a.obj")
 
 

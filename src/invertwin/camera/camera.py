@@ -57,10 +57,8 @@ class Camera:
         do = "give the camera's axes as columns, once or for each frame"
         axes = checks.checked_tensor(axes, (len(places), 3, 3), "rotations of a camera", do)
         checks.check_orthonormal(axes, "rotations of a camera", do)
-        pixels = checks.checked_count(self.width, "width", 1) * checks.checked_count(
-            self.height, "height", 1
-        )
-        require_at_most(pixels, _MAX_PIXELS, "pixels", "bin them")
+        sides = (checks.checked_count(getattr(self, k), k, 1) for k in ("width", "height"))
+        require_at_most(math.prod(sides), _MAX_PIXELS, "pixels", "bin them")
         focal = checks.checked_tensor(self.focal, (), "focal length [pixel]", "give one number")
         checks.checked_number(focal, "focal length [pixel]", 0.0, open_low=True)
         middle = torch.tensor([self.width / 2, self.height / 2], dtype=torch.float64)

@@ -94,6 +94,9 @@ class Checkpoint(Callback):
         if not (self.resume and path.is_file()):
             return
         with convert_read_errors(path, "a whole checkpoint", "delete it or start without resume"):
+            # torch spends minutes on its message about names of a million letters.
+            if torch.serialization.get_unsafe_globals_in_checkpoint(path):
+                raise ValueError("it holds classes that no checkpoint has")
             state = torch.load(path, weights_only=True)
             restored = isinstance(state, dict) and fit.restore(state)
         if not restored:
