@@ -101,7 +101,8 @@ def turn(name: str, seconds: float, seed: int, out: Path) -> dict[str, Any]:
         found = json.loads(ended.stdout.splitlines()[-1])
     except (subprocess.TimeoutExpired, json.JSONDecodeError, IndexError) as error:
         last = folder / "case.json"
-        cases, edits = json.loads(last.read_text()) if last.exists() else (0, None)
+        kept = last.read_text() if last.exists() else ""  # empty, if it died of writing it
+        cases, edits = json.loads(kept) if kept else (0, None)
         died = {"what": said or str(error)[-200:], "count": 1, "edits": [edits]}
         found = {"cases": cases + 1, "slowest_seconds": 0.0, "failures": {"died": died}}
     (folder / "case.json").unlink(missing_ok=True)
