@@ -186,7 +186,7 @@ def bare_rays_per_second(paths: int = 1_000_000, repeats: int = 5) -> float:
     import drjit as dr
 
     mesh = walls_of(DIVISIONS)
-    one = torch.zeros(len(mesh.faces), dtype=torch.int64)
+    one = torch.zeros(len(mesh.vertices), dtype=torch.int64)
     tree = Topology(mesh.faces, one, mesh.vertices, np.zeros(1, dtype=np.int64))
     scene = tree.ray_scene(mesh.vertices.float())
     start, end = (mi.Point3f(x, y, z - SIZE[2] / 2) for x, y, z in (TRANSMITTER, RECEIVER))
