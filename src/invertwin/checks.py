@@ -19,7 +19,7 @@ from invertwin.limits import MAX_LENGTH, MAX_NUMBER, AllowedValues, UsualValue, 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 Point = Annotated[ArrayLike, Len(3, 3)]
 MAX_COUNTED = 10**8
-"""Of what lies in memory, such as vertices and nodes."""
+"""Greatest count of what lies in memory, such as vertices and nodes."""
 Counts = Annotated[Sequence[Annotated[int, Ge(2)]], Len(3, 3)]
 _LIMITS: dict[type, tuple[str, str, Any]] = {
     Gt: ("gt", "above", operator.gt),

@@ -261,9 +261,8 @@ def _check_sweep(
 
 
 def _check_directions(values: checks.ArrayLike, what: str) -> Tensor:
-    found = checks.checked_tensor(
-        values, (None, 3), what, "give x, y, z of each, towards the radar"
-    )
+    do = "give x, y, z of each, towards the radar"
+    found = checks.checked_tensor(values, (None, 3), what, do)
     length = found.norm(dim=1, keepdim=True)
     if not len(found) or not bool((length > 0).all()):
         raise InputError(f"expected {what} of some length, got {len(found)}; give x, y, z of each")

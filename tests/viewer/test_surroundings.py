@@ -10,7 +10,7 @@ import torch
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, box, planar_array, plate, rigid
 from invertwin.viewer import Display, build_display
-from invertwin.viewer.surroundings import draw_ground, legend_html, open_wall, set_camera
+from invertwin.viewer.surroundings import draw_ground, legend_html, open_walls, set_camera
 
 
 def display(scale: float = 1.0) -> Display:
@@ -86,13 +86,13 @@ def test_the_first_camera_is_behind_and_above_the_radar_and_sees_all(scale):
 def test_walls_are_seen_through_from_behind_and_objects_are_not():
     shown = display()
     layers = {layer.name: layer for layer in shown.layers}
-    turned = open_wall(layers["twin/wall"], shown)
+    turned = open_walls(shown).get("twin/wall")
     assert turned is not None
     first, second, third = layers["twin/wall"].points[turned].transpose(1, 0, 2)
     normals = np.cross(second - first, third - first)
     assert (normals[:, 0] < 0).all()  # towards the radar
-    assert open_wall(layers["twin/cube"], shown) is None
-    assert open_wall(layers["boards"], shown) is None
+    assert open_walls(shown).get("twin/cube") is None
+    assert open_walls(shown).get("boards") is None
 
 
 def test_a_closed_room_is_open_to_who_looks_from_outside():
@@ -100,16 +100,16 @@ def test_a_closed_room_is_open_to_who_looks_from_outside():
     table = Object(box([1.0, 0.6, 0.1]), RoughDielectric(4.0))
     shown = build_display(Scene({"room": room, "table": table}), {}, "title")
     layer = shown.layers[0]
-    turned = open_wall(layer, shown)
+    turned = open_walls(shown).get(layer.name)
     assert turned is not None
     first, second, third = layer.points[turned].transpose(1, 0, 2)
     assert ((np.cross(second - first, third - first) * first).sum(1) < 0).all()
-    assert open_wall(shown.layers[1], shown) is None
+    assert open_walls(shown).get(shown.layers[1].name) is None
 
 
 def test_a_single_surface_is_no_wall():
     shown = build_display(Scene({"plate": Object(plate(1.0, 1.0), RoughDielectric(4.0))}), {}, "")
-    assert open_wall(shown.layers[0], shown) is None
+    assert open_walls(shown).get(shown.layers[0].name) is None
 
 
 def test_the_legend_names_the_roles_that_there_are():

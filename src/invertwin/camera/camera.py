@@ -49,9 +49,8 @@ class Camera:
         do = "give x, y, z, or a row of them for each frame"
         given = torch.as_tensor(self.positions, dtype=torch.float64)
         shape = (3,) if given.ndim == 1 else (None, 3)
-        places = checks.checked_tensor(
-            given, shape, "positions of a camera", do, MAX_LENGTH
-        ).reshape(-1, 3)
+        what = "positions of a camera"
+        places = checks.checked_tensor(given, shape, what, do, MAX_LENGTH).reshape(-1, 3)
         axes = torch.as_tensor(self.rotations, dtype=torch.float64)
         axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
         do = "give the camera's axes as columns, once or for each frame"
@@ -133,9 +132,8 @@ class Camera:
     def detach(self) -> "Camera":
         """Return the camera without derivatives."""
         names = ("positions", "rotations", "focal", "centre")
-        return replace(
-            self, **{name: checks.strip_derivatives(getattr(self, name)) for name in names}
-        )
+        fixed = {name: checks.strip_derivatives(getattr(self, name)) for name in names}
+        return replace(self, **fixed)
 
     @property
     def principal_point(self) -> Float64[Tensor, "2"]:

@@ -55,14 +55,13 @@ def option(*words: str, **given: Any) -> Any:
     return typer.Option(*words[:-1], help=words[-1], **given)
 
 
-def argument(text: str, **given: Any) -> Any:
+def argument(text: str) -> Any:
     """Return an argument of a command, whose default is not shown.
 
     Args:
         text: Its help.
-        given: What ``typer.Argument`` takes.
     """
-    return typer.Argument(help=text, show_default=False, **given)
+    return typer.Argument(help=text, show_default=False)
 
 
 BackendOption = Annotated[

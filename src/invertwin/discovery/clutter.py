@@ -58,9 +58,8 @@ def reconstruct_among_clutter(
         InputError: As ``reconstruct``; another model; random frames; new modules in a later stage;
             no object that moves.
     """
-    given = (
-        [observations] if isinstance(observations, inversion.Observation) else list(observations)
-    )
+    is_single = isinstance(observations, inversion.Observation)
+    given = [observations] if is_single else list(observations)
     unknowns = name_unknowns(parameters)
     if not always:
         plain = inversion.reconstruct(

@@ -53,9 +53,8 @@ def calibrate_on_scene(
         power = now.spectrum(bins).detach().double()
         power, coarse = reflectivity.thin_map(power, radar, bins)
         level = estimate_background(power)[:, None, None].expand_as(power)
-        image = reflectivity.reconstruct_reflectivity(
-            reflectivity.compute_response(radar, coarse, positions), power, level
-        )
+        response = reflectivity.compute_response(radar, coarse, positions)
+        image = reflectivity.reconstruct_reflectivity(response, power, level)
         found = _estimate_gains(capture, flat, positions, image)
         if number == 0 and phase_spread(found, radar) < _MIN_PHASE_SPREAD:
             return None

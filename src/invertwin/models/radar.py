@@ -150,9 +150,8 @@ class SurrogateMap(ForwardModel):
         ):
             return None
         fields, link = replace(self.sampling, boundary=False), sensor.link()
-        looks = SpeckleRealisations(
-            channel.trace_field(rest, link, sampling=fields, seed=seed), sensor
-        )
+        paths = channel.trace_field(rest, link, sampling=fields, seed=seed)
+        looks = SpeckleRealisations(paths, sensor)
         targets = [
             beat_signal(channel.trace_target(scene, name, link, sampling=fields), sensor)
             for name in self.coherent
@@ -233,9 +232,8 @@ class ExactMap(ForwardModel):
         """The model with rough points that stay while the scene moves."""
         if self.speckle is not None:
             return self
-        return replace(
-            self, speckle=channel.draw_speckle(scene, sensor.link(), self.sampling, seed)
-        )
+        speckle = channel.draw_speckle(scene, sensor.link(), self.sampling, seed)
+        return replace(self, speckle=speckle)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 And of a camera's images and their derivatives.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -190,8 +190,8 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
         largest = residual.abs().argmax(dim, keepdim=True)
         panel = MapPanel(residual.gather(dim, largest).squeeze(dim), ranges, across, label)
         image = _draw_signed(cell, "", panel, 2 * marked)
-        half = 0.5 * (_bin_edges(ranges)[1] - _bin_edges(ranges)[0]) / len(ranges)
-        wide = 0.5 * (_bin_edges(across)[1] - _bin_edges(across)[0]) / len(across)
+        half = 0.5 * (bin_edges(ranges)[1] - bin_edges(ranges)[0]) / len(ranges)
+        wide = 0.5 * (bin_edges(across)[1] - bin_edges(across)[0]) / len(across)
         for row, column in (panel.values.abs() > marked).nonzero().tolist():
             corner = float(across[column]) - wide, float(ranges[row]) - half
             cell.add_patch(Rectangle(corner, 2 * wide, 2 * half, fill=False, linewidth=0.8))
@@ -246,7 +246,7 @@ def _limit(panel: MapPanel) -> float:
 
 
 def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style: Any) -> Any:
-    extent = (*_bin_edges(panel.across), *_bin_edges(panel.ranges))
+    extent = (*bin_edges(panel.across), *bin_edges(panel.ranges))
     image = cell.imshow(values, origin="lower", aspect="auto", extent=extent, **style)
     label_axes(cell, title, panel.label)
     if panel.label in (U_LABEL, V_LABEL):
@@ -269,8 +269,12 @@ def _add_degrees(cell: Any, name: str) -> None:
     scale.set_xlabel(f"{name} [°]", fontsize=7, labelpad=2)
 
 
-def _bin_edges(positions: Tensor) -> tuple[float, float]:
-    """Outer edges of the first and the last bin."""
+def bin_edges(positions: Tensor | Sequence[float]) -> tuple[float, float]:
+    """Outer edges of the first and the last bin.
+
+    Args:
+        positions: Middles of the bins, evenly spaced.
+    """
     half = 0.5 * float(positions[1] - positions[0]) if len(positions) > 1 else 0.5
     return float(positions[0]) - half, float(positions[-1]) + half
 

@@ -269,11 +269,12 @@ class _FileResolver(FilePathResolver):
 
 
 def _load_trimesh_scene(path: Path) -> trimesh.Scene:
-    suffix, data = path.suffix.lower(), path.read_bytes()
-    mark, most = _GROUPS.get(suffix, (b"\n", math.inf))
-    require_at_most(data.count(mark), most, "groups or nodes", "join those of one material")
-    if suffix == ".obj":
-        _check_obj(data.replace(b"\r", b"").replace(b"\\\n", b""))
+    suffix = path.suffix.lower()
+    if suffix in _GROUPS:
+        (mark, most), data = _GROUPS[suffix], path.read_bytes()
+        require_at_most(data.count(mark), most, "groups or nodes", "join those of one material")
+        if suffix == ".obj":
+            _check_obj(data.replace(b"\r", b"").replace(b"\\\n", b""))
     if suffix != ".inp":
         return trimesh.load_scene(path, process=False, resolver=_FileResolver(str(path)))
     text = untrusted.read_text(path, "an .inp mesh")

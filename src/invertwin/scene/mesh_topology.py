@@ -158,7 +158,8 @@ def separate_groups(points: Points, groups: Groups) -> Points:
     found = np.empty_like(points)
     for row, own in enumerate(np.split(index, start[1:]) if len(start) > 1 else [slice(None)]):
         # Extrema of one run, ten times faster than those along the axis.
-        part = points[own] - np.minimum.reduceat(points[own], [0])
+        part = points[own]
+        part = part - np.minimum.reduceat(part, [0])
         part /= np.linalg.norm(np.maximum.reduceat(part, [0])) or 1.0
         part[:, 0] += 2.0 * row
         found[own] = part

@@ -89,13 +89,15 @@ def _draw_axes(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from invertwin.plotting.maps import bin_edges
+
     figure = Figure((3.2, 2.5), dpi=200)
     axes = figure.add_axes((0.15, 0.19, 0.64, 0.7))
     title, low, high, cmap = f"{name} [dB below peak]", MIN_LEVEL_DB, 0.0, POWER_COLORMAP
     if name == RESIDUAL:
         title, cmap = f"{MEASURED} over {SIMULATED} [dB]", RESIDUAL_COLORMAP
         low, high = -MAX_RESIDUAL_DB, MAX_RESIDUAL_DB
-    extent = (*_bin_edges(across), *_bin_edges(ranges))
+    extent = (*bin_edges(across), *bin_edges(ranges))
     image = axes.imshow(np.zeros((1, 1)), cmap, aspect="auto", vmin=low, vmax=high, extent=extent)
     figure.colorbar(image, cax=figure.add_axes((0.82, 0.19, 0.03, 0.7)))
     sines = np.clip(extent[:2], -1.0, 1.0)
@@ -114,11 +116,6 @@ def _draw_axes(
     box = axes.get_window_extent()
     rows = slice(round(len(drawn) - box.y1), round(len(drawn) - box.y0))
     return drawn.copy(), rows, slice(round(box.x0), round(box.x1))
-
-
-def _bin_edges(centers: Sequence[float]) -> tuple[float, float]:
-    half = 0.5 * (centers[1] - centers[0]) if len(centers) > 1 else 0.5
-    return centers[0] - half, centers[-1] + half
 
 
 def _image_html(name: str, pixels: NDArray[np.uint8]) -> str:

@@ -92,6 +92,8 @@ class Viewer:
         self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
         self._nodes: dict[str, Any] = {}
+        self._labels: dict[str, Any] = {}
+        self._walls = surroundings.open_walls(display)
         self._visible = display.groups | {x: x != SAMPLED_PATHS for x in POSITION_LAYERS if sensors}
         self._build_window()
         self._worker = threading.Thread(target=self._run_worker, daemon=True)
@@ -276,14 +278,15 @@ class Viewer:
         if layer.kind == "surface":
             how |= {"color": layer.color, "opacity": None if layer.opacity == 1 else layer.opacity}
             how |= {"cast_shadow": False, "receive_shadow": False}
-            wall = surroundings.open_wall(layer, self._display)
-            faces, side = (layer.faces, "double") if wall is None else (wall, "front")
-            look = {"flat_shading": True, "side": side}
+            faces = self._walls.get(layer.name, layer.faces)
+            look = {
+                "flat_shading": True,
+                "side": "front" if layer.name in self._walls else "double",
+            }
             made = scene.add_mesh_simple(node, layer.points, faces, **look, **how)
             if layer.group == "twin":
                 name, top = layer.name.split("/", 1)[1], self._top(layer)
-                label = scene.add_label(f"{node}/name", name, position=top, visible=visible)
-                self._nodes[f"{layer.name}/name"] = label
+                self._labels[layer.name] = scene.add_label(f"{node}/name", name, position=top)
         elif layer.kind == "lines":
             pairs = layer.points.reshape(-1, 2, 3)
             thick = {"thickness": 1.5, "thickness_units": "screen"}
@@ -310,9 +313,8 @@ class Viewer:
             self._due.clear()
             if self._closed:
                 return
-            if not due:  # the slider's own callback follows
+            if not due:  # the slider notes its step
                 self._step.value = (self._wish.step + 1) % len(self._steps)
-                self._update_state(step=self._step.value)
                 self._due.clear()
             with self._lock:
                 wish = self._wish
@@ -336,7 +338,7 @@ class Viewer:
                 node = self._nodes[layer.name]
                 if node.faces.shape == layer.faces.shape and (node.faces == layer.faces).all():
                     node.vertices = layer.points
-                    self._nodes[f"{layer.name}/name"].position = self._top(layer)
+                    self._labels[layer.name].position = self._top(layer)
                 else:
                     self._draw_layer(layer)
         self._where.visible, self._where.value = True, step.label

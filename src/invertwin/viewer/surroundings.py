@@ -1,11 +1,11 @@
-"""What surrounds a scene in the window: ground with metres, first camera, legend, walls."""
+"""Surroundings of a scene in the window: ground with metres, first camera, legend, walls."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from invertwin.viewer.display import Display, DisplayLayer
+from invertwin.viewer.display import Display
 from invertwin.viewer.layers import ROLES
 
 _TICKS = 6  # of the ground along its longer side, about
@@ -79,25 +79,25 @@ def legend_html(display: Display) -> str:
     return f'{hidden}<div style="padding: 0.3em 1em">{" &nbsp; ".join(rows)}</div>'
 
 
-def open_wall(layer: DisplayLayer, display: Display) -> NDArray[np.int32] | None:
-    """Return the triangles of a wall turned towards the scene; None for what is no wall.
+def open_walls(display: Display) -> dict[str, NDArray[np.int32]]:
+    """Return the triangles of walls, turned towards the scene, by the name of the layer.
 
     Who stands behind a wall then sees through it.
 
     Args:
-        layer: A surface.
         display: What is shown.
     """
     low, high = display.box
-    spans = np.ptp(layer.points, axis=0) if len(layer.points) else np.zeros(3)
-    several = sum(one.kind == "surface" for one in display.layers) > 1
-    is_short = (spans < _WALL_SHARE * (high - low)).sum() > 1
-    if layer.color != ROLES["fixed"] or not several or is_short:
-        return None
-    first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
-    toward = _framed_points(display).mean(0) - first
-    turned = (np.cross(second - first, third - first) * toward).sum(1) < 0
-    return np.where(turned[:, None], layer.faces[:, [0, 2, 1]], layer.faces)
+    middle, found = _framed_points(display).mean(0), dict[str, NDArray[np.int32]]()
+    surfaces = [layer for layer in display.layers if layer.kind == "surface" and len(layer.points)]
+    for layer in surfaces if len(surfaces) > 1 else []:
+        is_short = np.ptp(layer.points, axis=0) < _WALL_SHARE * (high - low)
+        if layer.color == ROLES["fixed"] and is_short.sum() < 2:
+            first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
+            normal = np.cross(second - first, third - first)
+            turned = (normal * (middle - first)).sum(1, keepdims=True) < 0
+            found[layer.name] = np.where(turned, layer.faces[:, [0, 2, 1]], layer.faces)
+    return found
 
 
 def _framed_points(display: Display) -> NDArray[np.float32]:

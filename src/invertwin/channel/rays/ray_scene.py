@@ -354,9 +354,11 @@ def find_passed_sheets(
         Mask of segments that nothing but sheets blocks, and numbers of segments with the triangle
         of the first sheet on each, of the second, and so on.
     """
+    if not bool(sheets.any()):
+        return is_visible(rays, start, end), []
     clear, passed = torch.zeros(len(start), dtype=torch.bool), list[tuple[Tensor, Tensor]]()
     row = torch.arange(len(start))
-    for _ in range(_MAX_SHEETS + 1):
+    while len(row) and len(passed) <= _MAX_SHEETS:
         face, share = find_next_surface(rays, start, end[row])
         clear[row[face < 0]] = True
         through = (face >= 0) & sheets[face]

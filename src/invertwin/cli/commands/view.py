@@ -88,7 +88,8 @@ def _display_of_run(
         title = run.title or file.stem
         names = run.fitted_objects
         # Without a fit, show objects at their current pose.
-        own = truth if folder is None or not (folder / VIEW_FILE).is_file() else scene
+        is_fit = folder is not None and (folder / VIEW_FILE).is_file()
+        own = scene if is_fit else truth
         depth = run.reconstruct.depth if run.reconstruct else getattr(run.data, "depth", 1)
         links = {
             name: viewer.InteractiveSensor(own, radar, grid, depth)
@@ -96,9 +97,9 @@ def _display_of_run(
             if grid is not None
         }
         display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
-        display = replace(display, steps=_steps_in_time(run, own))
+        display = replace(display, steps=[] if is_fit else _steps_in_time(run, own))
         antennas = _build_link_layers(run, own, folder)
-    if folder is not None and (folder / VIEW_FILE).is_file():
+    if folder is not None and is_fit:
         display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():
             if display.steps:
@@ -112,7 +113,7 @@ def _display_of_run(
 
 
 def _read_answer(file: Path) -> str:
-    """What a run found, with its verdict; empty if it says nothing."""
+    """Read the sentence that a run found, with its verdict; empty if it says nothing."""
     if not file.is_file():
         return ""
     with convert_read_errors(file, "the metrics of a run"):
@@ -122,7 +123,7 @@ def _read_answer(file: Path) -> str:
 
 
 def _steps_in_time(run: RunFile, scene: Scene) -> list[viewer.DisplayStep]:
-    """What moves, at times from the start of the recording on."""
+    """Steps of what moves, at times from the start of the recording on."""
     moving = build_moving_scene(run, scene)
     if isinstance(moving, Scene):
         return []
@@ -130,7 +131,8 @@ def _steps_in_time(run: RunFile, scene: Scene) -> list[viewer.DisplayStep]:
     with suppress(InputError):  # a trajectory ends
         for number in range(_TIMES):
             time = number * _TIME_STEP
-            bodies = {name: viewer.display_mesh(moving(time)[name]) for name in moving.motions}
+            then = moving(time)
+            bodies = {name: viewer.display_mesh(then[name]) for name in moving.motions}
             steps.append(viewer.DisplayStep(number, f"time {time:.2f} s", bodies))
     return steps
 
