@@ -41,6 +41,7 @@ computes both anew with bempp-cl, with a mesh of that step in wavelengths.
 
 import argparse
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -86,7 +87,10 @@ from invertwin.links import AntennaMount, frequency_response
 from invertwin.scene import AntennaArray, Mesh, Object, PerfectConductor, Scene, box
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 from invertwin.scene.material.slab import SlabLayer, slab_coefficients
-from oracles.exact_wedge import (
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from oracles.exact_wedge import (  # noqa: E402
     half_plane_plane_wave,
     half_plane_point_source,
     wedge_plane_wave,
