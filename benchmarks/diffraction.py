@@ -90,7 +90,7 @@ from invertwin.scene.material.slab import SlabLayer, slab_coefficients
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from oracles.exact_wedge import (  # noqa: E402
+from oracles.exact_wedge import (
     half_plane_plane_wave,
     half_plane_point_source,
     wedge_plane_wave,
