@@ -14,13 +14,7 @@ from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar, require_sampled_waveform
-from invertwin.radar.signal.chirps import (
-    Chirps,
-    ChirpTrain,
-    PointTrajectory,
-    sample_interval,
-    simulate_chirp_train,
-)
+from invertwin.radar.signal import chirps as trains
 from invertwin.radar.signal.impairments import Impairments
 from invertwin.radar.signal.keyframes import VisibilityKeyframes, vertex_displacements
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
@@ -114,7 +108,7 @@ def simulate(
 def simulate_chirps(
     scene: Scene | Callable[[float], Scene],
     radar: Radar,
-    chirps: Chirps,
+    chirps: trains.Chirps,
     *,
     seed: int,
     sampling: Sampling | None = None,
@@ -153,7 +147,9 @@ def simulate_chirps(
             several loops where nothing is traced anew, or of paths of several bounces.
     """
     checked_type(radar, Radar, "a radar", "build one with Radar(...)")
-    checked_type(chirps, Chirps, "the timing of chirps", "build it with Chirps(count, interval)")
+    checked_type(
+        chirps, trains.Chirps, "the timing of chirps", "build it with Chirps(count, interval)"
+    )
     again = retrace or not isinstance(scene, Scene)
     if again and impairments is not None:
         impairments.check_applicable()
@@ -177,17 +173,17 @@ def simulate_chirps(
         # Ramps of what moves are small work, which several threads on a busy machine slow tenfold.
         with torch.no_grad(), torch_threads(1):
             blocks = VisibilityKeyframes(motion, trace_instant, radar, chirps, visibility_every)
-            beat = simulate_chirp_train(chirps, radar.shape[1], blocks.simulate_ramp)
+            beat = trains.simulate_chirp_train(chirps, radar.shape[1], blocks.simulate_ramp)
         return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
     waveform = require_sampled_waveform(radar)
-    half = 0.5 * (waveform.samples - 1) * sample_interval(waveform)
+    half = 0.5 * (waveform.samples - 1) * trains.sample_interval(waveform)
 
     def simulate_ramp(start: float, senders: list[int]) -> Tensor:
         paths, places = _trace_ramp(motion, start + half, half, trace_instant, radar)
         check_paths(paths, radar, waveform)
-        return ChirpTrain(paths, radar, places).simulate_ramp(start, senders)
+        return trains.ChirpTrain(paths, radar, places).simulate_ramp(start, senders)
 
-    beat = simulate_chirp_train(chirps, radar.shape[1], simulate_ramp)
+    beat = trains.simulate_chirp_train(chirps, radar.shape[1], simulate_ramp)
     return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
 
 
@@ -197,7 +193,7 @@ def _trace_ramp(
     half_duration: float,
     trace: Callable[[Scene], Paths],
     radar: Radar,
-) -> tuple[Paths, PointTrajectory]:
+) -> tuple[Paths, trains.PointTrajectory]:
     """Paths in the middle of a ramp, and where their points are half a ramp before and after."""
     scene = motion(middle)
     ahead = vertex_displacements(scene, motion(middle + half_duration))

@@ -12,9 +12,11 @@ from invertwin.channel.coherent.speckle import Speckle as Speckle
 from invertwin.channel.coherent.speckle import draw_speckle as draw_speckle
 from invertwin.channel.coverage.coverage import PathMeasure as PathMeasure
 from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
+from invertwin.channel.coverage.single_scattering import scattered_power as scattered_power
 from invertwin.channel.coverage.single_scattering import (
     trace_single_scattering as trace_single_scattering,
 )
+from invertwin.channel.coverage.single_scattering import without_specular as without_specular
 from invertwin.channel.em.plane_waves import polarisations as polarisations
 from invertwin.channel.paths import GainPattern as GainPattern
 from invertwin.channel.paths import Grid as Grid

@@ -15,14 +15,8 @@ from invertwin.checks import checked_count, checked_number, checked_tensor
 from invertwin.constants import read_table
 from invertwin.discovery import certainty
 from invertwin.discovery.assembly import ShapeLikelihood, make_sampling
+from invertwin.discovery.imaging import likelihood as likelihoods
 from invertwin.discovery.imaging import point_detections
-from invertwin.discovery.imaging.likelihood import (
-    HeavyTailedLoss,
-    count_bins_per_draw,
-    direction_axes,
-    estimate_background,
-    map_axes,
-)
 from invertwin.discovery.imaging.reflectivity import compute_response
 from invertwin.discovery.outcome import DetectedObject, GroundImage, Twin
 from invertwin.discovery.search import ImageGrid, ShapeSearch
@@ -169,7 +163,10 @@ def _find_static_objects(
     radar, frames = capture.radar(), capture.frame_count
     model = SurrogateMap(grid, sampling=make_sampling(frames, rays))
     level_of_bins = _estimate_background(power, radar, grid)
-    loss, draw = HeavyTailedLoss(level_of_bins), count_bins_per_draw(map_axes(radar, grid))
+    loss, draw = (
+        likelihoods.HeavyTailedLoss(level_of_bins),
+        likelihoods.count_bins_per_draw(likelihoods.map_axes(radar, grid)),
+    )
     one = ShapeLikelihood(model, radar, power, loss, draw, level, seed)
     held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
@@ -201,8 +198,8 @@ def _find_static_objects(
         there = aside.coarse_maps
         powers = torch.zeros_like(there.power), seen_there.predict_maps(picture)
         nothing, image = (there.loss.bin_losses(power, there.power) for power in powers)
-        gain = float((nothing - image).sum()) / count_bins_per_draw(
-            map_axes(aside.radar, there.grid)
+        gain = float((nothing - image).sum()) / likelihoods.count_bins_per_draw(
+            likelihoods.map_axes(aside.radar, there.grid)
         )
         if gain > aside.total_gain(shapes):
             notes = (_NOTES["image_better"],)
@@ -300,7 +297,9 @@ def _relate_to_noise(
 def _estimate_background(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, " range"]:
-    return estimate_background(power, count_bins_per_draw(direction_axes(radar, grid)))
+    return likelihoods.estimate_background(
+        power, likelihoods.count_bins_per_draw(likelihoods.direction_axes(radar, grid))
+    )
 
 
 def image_points(

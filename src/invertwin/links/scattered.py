@@ -15,21 +15,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.channel import Grid, Link, RayPaths, Sampling, deposit_power, trace_single_scattering
+from invertwin import channel
 from invertwin.checks import refuse_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.responses import AntennaMount
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene import Isotropic, Material, Pattern, ScatteringLaw, Scene
+from invertwin.scene import Isotropic, Pattern, Scene
 from invertwin.scene.antenna import COSINE_COUNT
 
 _POSITIONS_PER_BATCH = 8192
 _BINS = 64  # of length; moments are exact whatever their number
 _ANGLES = 360  # of a turned pattern about its axis
+_Legs = channel.RayPaths
 
 
 def scattered_moments(
@@ -38,7 +39,7 @@ def scattered_moments(
     receivers: AntennaMount,
     positions: Float64[Tensor, "place 3"],
     frequency: float,
-    sampling: Sampling,
+    sampling: channel.Sampling,
     seed: int,
     *,
     depth: int = 1,
@@ -82,55 +83,35 @@ def scattered_moments(
             counts = (sampling.samples, sampling.boundary_samples)
             samples, edges = (math.ceil(n * (len(some) / len(positions))) for n in counts)
             drawn = replace(sampling, samples=samples, boundary_samples=edges)
-            power = deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
+            power = channel.deposit_power(rough, link, grid, sampling=drawn, seed=seed + batch)
             found.append(_delay_moments(power[..., 0, 0].double(), grid, link))
         rows.append(torch.cat(found))
     total = torch.stack(rows)
     if depth < 2:
         return total
 
-    def measure(
-        tx_paths: RayPaths, rx_paths: RayPaths, cross_polar: Tensor, tx: Tensor, rx: Tensor
-    ) -> Tensor:
-        ends = (sensor.mount, tx_paths), (receivers, rx_paths)
-        sent, taken = (_stokes(p, end.element_weights(p.departure, p.tx)) for end, p in ends)
-        whole, q, u, v = (0.5 * sent * taken).unbind(1)
-        power = whole + (1 - 2 * cross_polar) * (q + u) - (1 - 4 * cross_polar) * v
-        straight = (rx[rx_paths.tx] - tx[tx_paths.tx]).norm(dim=1)
-        excess = tx_paths.delay + rx_paths.delay - straight / SPEED_OF_LIGHT
+    def measure(out: _Legs, back: _Legs, cross_polar: Tensor, tx: Tensor, rx: Tensor) -> Tensor:
+        ends = (sensor.mount, out), (receivers, back)
+        sent, taken = (end.element_weights(p.departure, p.tx) for end, p in ends)
+        power = channel.scattered_power(out, back, sent, taken, cross_polar)
+        straight = (rx[back.tx] - tx[out.tx]).norm(dim=1)
+        excess = out.delay + back.delay - straight / SPEED_OF_LIGHT
         return torch.stack([power, power * excess, power * excess**2], 1)
 
-    return total + trace_single_scattering(
-        scene,
-        rough,
-        sensor.positions,
-        positions,
-        frequency,
-        measure,
-        3,
+    return total + channel.trace_single_scattering(
+        *(scene, rough, sensor.positions, positions, frequency, measure, 3),
         rays=rays,
         sampling=replace(sampling, depth=depth),
         seed=seed,
     )
 
 
-def _stokes(
-    paths: RayPaths, weights: Complex128[Tensor, "path element 2"]
-) -> Float64[Tensor, "path 4"]:
-    """Mean Stokes parameters, over the elements of an antenna, at the far ends of paths."""
-    field = torch.einsum("pij,pej->pei", paths.coefficient, weights)
-    power = torch.view_as_real(field).square().sum(-1)
-    both = field[..., 0] * field[..., 1].conj()
-    first, second = power.unbind(-1)
-    return torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1).mean(1)
-
-
 def _build_link(
     sensor: Transmitters, receivers: AntennaMount, positions: Tensor, frequency: float
-) -> Link:
+) -> channel.Link:
     """From one transmitter to receivers, in its axes."""
     count, turn = len(positions), sensor.mount.rotations.reshape(3, 3)
-    return Link(
+    return channel.Link(
         tx=sensor.positions.expand(count, 3),
         rx=positions,
         rotations=turn.expand(count, 3, 3),
@@ -143,7 +124,9 @@ def _build_link(
     )
 
 
-def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) -> Tensor:
+def _delay_moments(
+    power: Float64[Tensor, "place bin"], grid: channel.Grid, link: channel.Link
+) -> Tensor:
     """Sums of power, of power × excess delay and of power × its square."""
     excess = (2 * grid.ranges - (link.rx - link.tx).norm(dim=1, keepdim=True)) / SPEED_OF_LIGHT
     # A path lies in three bins, with weights whose second moment is a quarter of a squared step.
@@ -151,38 +134,20 @@ def _delay_moments(power: Float64[Tensor, "place bin"], grid: Grid, link: Link) 
     return torch.stack([part.sum(1) for part in parts], -1)
 
 
-@dataclass(frozen=True)
-class _IncoherentMaterial(Material):
-    """Scattering of a material without the specular reflection that ``trace_paths`` finds."""
-
-    base: Material
-
-    @property
-    def faces(self) -> int | None:
-        return self.base.faces
-
-    def scattering_law(self, frequency: float) -> ScatteringLaw:
-        """Return the incoherent part of the law. See ``Material.incoherent_law``."""
-        return self.base.incoherent_law(frequency)
-
-
 def _incoherent_scene(scene: Scene, frequency: float) -> Scene | None:
     """The scene as it scatters; None if it does not."""
-    objects = {
-        name: replace(item, material=_IncoherentMaterial(item.material))
-        for name, item in scene.objects.items()
-    }
+    rest = channel.without_specular(scene, scene.names)
     with torch.no_grad():
-        surfaces = [item.material.scattering_law(frequency) for item in objects.values()]
+        surfaces = [item.material.scattering_law(frequency) for item in rest.objects.values()]
         rough = any(bool((s.diffuse > 0).any() or (s.lobes > 0).any()) for s in surfaces)
-    return replace(scene, objects=objects) if rough else None
+    return rest if rough else None
 
 
-def _length_grid(scene: Scene, ends: Sequence[Tensor], depth: int) -> Grid:
+def _length_grid(scene: Scene, ends: Sequence[Tensor], depth: int) -> channel.Grid:
     """Bins that hold every path of so many bounces, with room for what sheets add."""
     points = torch.cat([item.vertices.detach() for item in scene.objects.values()] + [*ends])
     step = (0.6 * (depth + 1) * float((points.amax(0) - points.amin(0)).norm()) + 1.0) / (_BINS - 3)
-    return Grid(range_start=-step, range_step=step, range_count=_BINS)
+    return channel.Grid(range_start=-step, range_step=step, range_count=_BINS)
 
 
 def _rotate_pattern(receivers: AntennaMount, rotation: Float64[Tensor, "3 3"]) -> Pattern:

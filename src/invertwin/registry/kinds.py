@@ -35,16 +35,7 @@ from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, mod
 from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, AllowedLetters
-from invertwin.registry.section import (
-    TAG_MARK,
-    InputPath,
-    KeyInputError,
-    Section,
-    key,
-    prefix_errors,
-    raise_key_error,
-    tag_by,
-)
+from invertwin.registry import section
 
 PLUGINS = "invertwin.plugins"
 _ARGUMENT_DOCS = read_table("invertwin.registry", "arguments.toml")
@@ -53,7 +44,7 @@ _TASKS = ("simulate", "reconstruct", "gradcheck", "rcs", "dataset", "twin", "los
 _PLAIN_TYPES = (bool, int, float, str, list, tuple, dict)
 
 
-class ConstructorTable(Section):
+class ConstructorTable(section.Section):
     """A table that a constructor of the library makes something of."""
 
     made_by: ClassVar[Callable[..., Any]]
@@ -81,7 +72,7 @@ class ConstructorTable(Section):
                 if kind is not None:
                     found[name] = given[kind]
             elif getattr(self, place) is not None:
-                with prefix_errors(place):
+                with section.prefix_errors(place):
                     found[name] = registry.convert_value(getattr(self, place), hint, name, given)
         return found
 
@@ -93,14 +84,14 @@ class _CheckedTable(ConstructorTable):
     def _check_constructor(self) -> "_CheckedTable":
         try:
             self.build()
-        except KeyInputError as error:
-            raise_key_error(error.text, error.path)
+        except section.KeyInputError as error:
+            section.raise_key_error(error.text, error.path)
         except InputError as error:
-            raise_key_error(str(error))
+            section.raise_key_error(str(error))
         return self
 
 
-class _EmptyGroupTable(Section):
+class _EmptyGroupTable(section.Section):
     """No kind is known; plugins may add some."""
 
 
@@ -268,12 +259,12 @@ class Registry:
             return _EmptyGroupTable
         keys = (found.tag, *(name for name, kind in kinds.items() if kind.untagged))
         tables = {name: self.kind_table(group, name, base) for name in kinds}
-        members = [Annotated[table, Tag(TAG_MARK + name)] for name, table in tables.items()]
+        members = [Annotated[table, Tag(section.TAG_MARK + name)] for name, table in tables.items()]
         if found.points is not None:
-            members.append(Annotated[found.points, Tag(f"{TAG_MARK}points")])
+            members.append(Annotated[found.points, Tag(f"{section.TAG_MARK}points")])
         if all(kind.untagged for kind in kinds.values()):
             keys = keys[1:]
-        return Annotated[_union_type(members), tag_by(keys, found.default)]
+        return Annotated[_union_type(members), section.tag_by(keys, found.default)]
 
     @cache  # noqa: B019 - as above
     def kind_table(self, group: str, name: str, base: type[ConstructorTable] | None = None) -> Any:
@@ -287,7 +278,10 @@ class Registry:
         kind, base = self._kinds(group)[name], base or found.base
         fields: dict[str, Any] = {}
         if not kind.untagged:
-            fields[found.tag] = (Literal[name], key("", name if name == found.default else ...))
+            fields[found.tag] = (
+                Literal[name],
+                section.key("", name if name == found.default else ...),
+            )
         title = f"{name}_{base.__name__ if base is not ConstructorTable else group}"
         given = _camel_case(title), base, fields, kind.without
         return self.constructor_table(kind.make, *given, checked=kind.checked)
@@ -313,7 +307,7 @@ class Registry:
         """
         self._load_kinds()
         make = pkgutil.resolve_name(make) if isinstance(make, str) else make
-        if isinstance(make, type) and issubclass(make, Section):
+        if isinstance(make, type) and issubclass(make, section.Section):
             return make
         plain = isinstance(make, type) and not is_dataclass(make)
         hints = get_type_hints(make.__init__ if plain else make, include_extras=True)
@@ -353,14 +347,14 @@ class Registry:
         kind = self.run_file_type(hint, name)
         words = words.replace("[rad]", "[°]") if _is_angle(hint) else words
         if default is inspect.Parameter.empty:
-            return kind, key(words)
+            return kind, section.key(words)
         if not isinstance(default, _PLAIN_TYPES):
-            return _union_type([kind, None]), key(words, None)
+            return _union_type([kind, None]), section.key(words, None)
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _allowed_letters(hint):
             default = [*default]  # type: ignore[misc]
-        return kind, key(words, default, validate_default=isinstance(default, str))
+        return kind, section.key(words, default, validate_default=isinstance(default, str))
 
     def run_file_type(self, hint: Any, name: str) -> Any:
         """Return the type of an argument in run files.
@@ -388,7 +382,7 @@ class Registry:
             kind = self.run_file_type(arguments[0], name)
             return Annotated[(kind, *limits)] if limits else kind  # type: ignore[return-value]
         if Path in members:
-            return InputPath
+            return section.InputPath
         if hasattr(hint, "dim_str"):
             return _nested_list_type(hint.dim_str.split())
         if origin in (Union, UnionType):
@@ -491,17 +485,21 @@ def number_or_list(*kinds: Any) -> Any:
         bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
         if get_origin(bare) is list:
             return "list"
-        table = get_origin(bare) is dict or (isinstance(bare, type) and issubclass(bare, Section))
+        table = get_origin(bare) is dict or (
+            isinstance(bare, type) and issubclass(bare, section.Section)
+        )
         return "table" if table else "number"
 
     tags = [tag(kind) for kind in kinds]
 
     def form(value: Any) -> str:
-        kind = "table" if isinstance(value, dict | Section) else "number"
+        kind = "table" if isinstance(value, dict | section.Section) else "number"
         kind = "list" if isinstance(value, list) else kind
-        return TAG_MARK + (kind if kind in tags else tags[0])
+        return section.TAG_MARK + (kind if kind in tags else tags[0])
 
-    members = [Annotated[k, Tag(TAG_MARK + name)] for k, name in zip(kinds, tags, strict=True)]
+    members = [
+        Annotated[k, Tag(section.TAG_MARK + name)] for k, name in zip(kinds, tags, strict=True)
+    ]
     return Annotated[_union_type(members), Discriminator(form)]
 
 

@@ -14,19 +14,11 @@ from invertwin.checks import check_choice, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.limits import MAX_LENGTH
+from invertwin.scene import pose as poses
 from invertwin.scene.cloud import Cloud
 from invertwin.scene.material.roughness import ROUGH_LOBE_WIDTH, lobe_exponent
 from invertwin.scene.material.surface import Material
 from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import (
-    Basis,
-    FrameName,
-    compose,
-    from_frame,
-    rigid,
-    rotation_from_vector,
-    to_frame,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +93,14 @@ class Object:
         if self.velocity is None:
             return self
         if self.velocity.ndim == 1:
-            motion = rigid(translation=self.velocity * time)
-            return replace(self, pose=compose(self.transform, motion), velocity=None)
+            motion = poses.rigid(translation=self.velocity * time)
+            return replace(self, pose=poses.compose(self.transform, motion), velocity=None)
         # Velocities are world vectors; row vectors times R are in the object's frame.
         offsets = self.velocity * time @ self.transform[:3, :3]
         mesh = Mesh(self.mesh.vertices + offsets, self.mesh.faces)
         return replace(self, mesh=mesh, velocity=None)
 
-    def change_basis(self, basis: Basis) -> "Object":
+    def change_basis(self, basis: poses.Basis) -> "Object":
         """Return the object along other axes, those of its own frame included."""
         return replace(
             self,
@@ -218,18 +210,18 @@ class Scene:
         """Return the scene with all objects displaced by their velocities for `time` [s]."""
         return Scene({name: value.advance(time) for name, value in self.objects.items()})
 
-    def change_basis(self, basis: Basis) -> "Scene":
+    def change_basis(self, basis: poses.Basis) -> "Scene":
         """Return the scene along other axes."""
         moved = {name: value.change_basis(basis) for name, value in self.objects.items()}
         return replace(self, objects=moved)
 
-    def to_frame(self, frame: FrameName) -> "Scene":
+    def to_frame(self, frame: poses.FrameName) -> "Scene":
         """Return the scene in the frame of another program, see `invertwin.scene.to_frame`."""
-        return to_frame(self, frame)
+        return poses.to_frame(self, frame)
 
-    def from_frame(self, frame: FrameName) -> "Scene":
+    def from_frame(self, frame: poses.FrameName) -> "Scene":
         """Return the scene in our frame, given in that of another program."""
-        return from_frame(self, frame)
+        return poses.from_frame(self, frame)
 
 
 def warn_if_purely_specular(scene: Scene, frequency: float) -> None:
@@ -290,6 +282,6 @@ def displace(
         offset: displacement of its centre [3] [m].
         rotation: rotation vector [3] [rad]; None = no rotation.
     """
-    turn = rotation_from_vector(torch.zeros_like(offset) if rotation is None else rotation)
-    motion = rigid(turn, offset + item.center - turn @ item.center)
+    turn = poses.rotation_from_vector(torch.zeros_like(offset) if rotation is None else rotation)
+    motion = poses.rigid(turn, offset + item.center - turn @ item.center)
     return replace(item, pose=motion @ item.transform)

@@ -37,7 +37,7 @@ def summed(scene: Scene = SCENE, depth: int = 2, rays: int | None = None) -> Ten
 def test_chunks_of_points_add_up(monkeypatch):
     whole = summed()
     assert bool((whole > 0).all())
-    monkeypatch.setattr(module, "_POINTS_AT_ONCE", 700)
+    monkeypatch.setattr(module, "POINTS_AT_ONCE", 700)
     torch.testing.assert_close(summed(), whole, rtol=1e-12, atol=0)
 
 

@@ -20,12 +20,7 @@ from invertwin.channel.beams.beam_tracing import (
     build_facets,
     trace_beams,
 )
-from invertwin.channel.em.antenna_fields import (
-    antenna_fields,
-    coherent_paths,
-    conductor_field,
-    current_kernel,
-)
+from invertwin.channel.em import antenna_fields as antennas
 from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, concatenate_paths
 from invertwin.channel.rays.backend import tracing
@@ -137,16 +132,18 @@ def _field_paths(
     gain = link.tx_pattern.gain(torch.einsum("nij,ni->nj", rotation, departure))
     gain = gain * link.rx_pattern.gain(torch.einsum("nij,ni->nj", rotation, -leaving_direction))
     area = polygon_integral(patches.polygon - centroid[:, None], leaving_direction - arriving)
-    transmit = antenna_fields(link.tx_jones, rotation, departure)
+    transmit = antennas.antenna_fields(link.tx_jones, rotation, departure)
     # A reflection at a conductor maps E as it maps points, with opposite sign.
     transmit = (-1.0) ** (order - 1) * transmit @ unfolding.rotation.to(transmit.dtype)
-    receive = antenna_fields(link.rx_jones, rotation, -leaving_direction)
-    kernel = current_kernel(patches.normal, arriving, transmit, -leaving_direction, receive)
+    receive = antennas.antenna_fields(link.rx_jones, rotation, -leaving_direction)
+    kernel = antennas.current_kernel(
+        patches.normal, arriving, transmit, -leaving_direction, receive
+    )
     spread, leaving = gain / (length * distance) ** 2, dot(patches.normal, leaving_direction)
-    fields = conductor_field(spread, kernel, leaving)
+    fields = antennas.conductor_field(spread, kernel, leaving)
     fields = fields * area(2 * torch.pi / (stretch * link.wavelength))[:, None, None]
     delay = (length + distance) / SPEED_OF_LIGHT
-    return coherent_paths(link, frame, delay, fields, image, centroid)
+    return antennas.coherent_paths(link, frame, delay, fields, image, centroid)
 
 
 def _polygon_centroid(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:

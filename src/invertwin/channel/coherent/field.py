@@ -9,21 +9,11 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.coherent import radar_equation
 from invertwin.channel.coherent.multibounce_po import sample_surface_points, trace_multibounce_paths
 from invertwin.channel.coherent.power_paths import ProjectedSilhouettes, trace_shadow_boundary_paths
-from invertwin.channel.coherent.radar_equation import (
-    PathTransfer,
-    SurfacePaths,
-    evaluate_paths,
-    find_unblocked,
-)
 from invertwin.channel.coherent.speckle import Speckle, draw_speckle
-from invertwin.channel.em.antenna_fields import (
-    antenna_fields,
-    combine_elements,
-    conductor_field,
-    current_kernel,
-)
+from invertwin.channel.em import antenna_fields as antennas
 from invertwin.channel.em.depolarisation import random_scattering_matrix
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Link, Paths, concatenate_paths
@@ -112,20 +102,20 @@ def trace_field(
 
 def _trace_point_fields(
     rays: RayScene,
-    paths: SurfacePaths,
+    paths: radar_equation.SurfacePaths,
     kind: str,
-    field: Callable[[SurfacePaths, PathTransfer], Tensor],
+    field: Callable[[radar_equation.SurfacePaths, radar_equation.PathTransfer], Tensor],
 ) -> list[Paths]:
     """The paths in every frame in which their field does not vanish."""
     found, count = [], len(paths.weight)
     frames = torch.arange(rays.link.frame_count)
     for some in track(frames.split(max(1, _ROWS_AT_ONCE // max(1, count))), f"{kind} paths"):
         frame, row = some.repeat_interleave(count), torch.arange(count).repeat(len(some))
-        seen = find_unblocked(rays, frame, paths.select(row))
+        seen = radar_equation.find_unblocked(rays, frame, paths.select(row))
         kept = paths.select(row[seen])
-        echo = evaluate_paths(rays, frame[seen], kept)
+        echo = radar_equation.evaluate_paths(rays, frame[seen], kept)
         velocity = kept.velocity(rays.geometry)
-        coefficient, matrix = combine_elements(rays.link, field(kept, echo))
+        coefficient, matrix = antennas.combine_elements(rays.link, field(kept, echo))
         rows = echo.to_paths(kind, coefficient=coefficient, matrix=matrix, velocity=velocity)
         face = kept.face[:, 0] if kept.face.shape[1] == 1 else torch.full_like(kept.face[:, 0], -1)
         share = torch.stack([kept.b1[:, 0], kept.b2[:, 0]], dim=1)
@@ -134,7 +124,9 @@ def _trace_point_fields(
     return found
 
 
-def _rough_field(link: Link, paths: SurfacePaths, echo: PathTransfer) -> Tensor:
+def _rough_field(
+    link: Link, paths: radar_equation.SurfacePaths, echo: radar_equation.PathTransfer
+) -> Tensor:
     """Amplitude sqrt(f · weight), with the phase of the path, from polarisation to polarisation."""
     # A root of zero has no derivative.
     lit = echo.power > 0
@@ -147,13 +139,13 @@ def _trace_conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Pat
     """Physical optics of the conductors, and its boundary paths."""
     coherent = torch.tensor(rays.geometry.coherent)[rays.geometry.face_object]
 
-    def field(paths: SurfacePaths, echo: PathTransfer) -> Tensor:
+    def field(paths: radar_equation.SurfacePaths, echo: radar_equation.PathTransfer) -> Tensor:
         return conductor_matrix(rays.link, echo) * paths.weight[:, None, None]
 
-    def boundary_paths(edge: ProjectedSilhouettes, echo: PathTransfer) -> Paths:
+    def boundary_paths(edge: ProjectedSilhouettes, echo: radar_equation.PathTransfer) -> Paths:
         speed = (edge.area_rate - edge.area_rate.detach()) * coherent[edge.face]
         fields = conductor_matrix(rays.link, echo).detach() * speed[:, None, None]
-        coefficient, matrix = combine_elements(rays.link, fields)
+        coefficient, matrix = antennas.combine_elements(rays.link, fields)
         return echo.to_paths("coherent", coefficient=coefficient, matrix=matrix, boundary=True)
 
     areas = face_areas(rays.geometry) * coherent
@@ -164,7 +156,9 @@ def _trace_conductors(rays: RayScene, sampling: Sampling, seed: int) -> list[Pat
     return parts
 
 
-def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row r t"]:
+def conductor_matrix(
+    link: Link, echo: radar_equation.PathTransfer
+) -> Complex128[Tensor, "row r t"]:
     """Field coefficients per m² of a perfect conductor by physical optics; Jacobians included.
 
     ``a = (λ/4π) S / (R_t R_r)`` with ``S = −(jk/2π) ∫ p_r · [n × (d × p_t)] V dA`` (derivations §4
@@ -186,15 +180,15 @@ def conductor_matrix(link: Link, echo: PathTransfer) -> Complex128[Tensor, "row 
         kernel = -0.5 * dot(normal, ways[0] + ways[1])[:, None, None] * (received @ sent.mT)
     else:
         rotation = link.rotations[echo.frame]
-        sent = antenna_fields(link.tx_jones, rotation, ways[0])
-        received = antenna_fields(link.rx_jones, rotation, ways[1])
-        kernel = current_kernel(normal, ways[0], sent, ways[1], received)
-    field = conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
+        sent = antennas.antenna_fields(link.tx_jones, rotation, ways[0])
+        received = antennas.antenna_fields(link.rx_jones, rotation, ways[1])
+        kernel = antennas.current_kernel(normal, ways[0], sent, ways[1], received)
+    field = antennas.conductor_field(echo.spreading, kernel, -dot(normal, ways[1]))
     return field * point.jacobian[:, None, None]
 
 
 def rough_path_matrix(
-    link: Link, echo: PathTransfer, phase: Float64[Tensor, " row"]
+    link: Link, echo: radar_equation.PathTransfer, phase: Float64[Tensor, " row"]
 ) -> Complex128[Tensor, "#row r t"]:
     """Fields of rough paths between the vectors of both arrays, over those of V to V.
 

@@ -14,12 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel.coherent.radar_equation import SurfacePaths, trace_transmittance
-from invertwin.channel.em.antenna_fields import (
-    antenna_fields,
-    coherent_paths,
-    conductor_field,
-    current_kernel,
-)
+from invertwin.channel.em import antenna_fields as antennas
 from invertwin.channel.em.plane_waves import dot, reflect_vectors, triangle_normals
 from invertwin.channel.paths import Paths
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene, face_areas, find_next_surface
@@ -102,7 +97,7 @@ def _follow_rays(
     # The solid angle of a ray, from the area that its first point stands for.
     angle = points.weight[keep] * dot(normal, start).abs() / length**2
     direction = start
-    sent = antenna_fields(own_jones, link.rotations[frame], start)
+    sent = antennas.antenna_fields(own_jones, link.rotations[frame], start)
     extent = geometry.vertices.detach()
     reach = float((extent.amax(0) - extent.amin(0)).norm()) * 1.01
     for _ in range(2, depth + 1):
@@ -130,14 +125,16 @@ def _follow_rays(
         spread = gain * other.gain(leaving) * open_ / (length * distance) ** 2
         area = angle * length**2 / facing.abs().clamp_min(1e-9)
         lit_normal = -facing.sign()[:, None] * normal
-        received = antenna_fields(other_jones, link.rotations[frame], -onwards)
-        kernel = current_kernel(lit_normal, direction, sent, -onwards, received)
-        fields = conductor_field(spread, kernel, dot(lit_normal, onwards)) * area[:, None, None]
+        received = antennas.antenna_fields(other_jones, link.rotations[frame], -onwards)
+        kernel = antennas.current_kernel(lit_normal, direction, sent, -onwards, received)
+        fields = (
+            antennas.conductor_field(spread, kernel, dot(lit_normal, onwards)) * area[:, None, None]
+        )
         fields = fields.mT if from_receiver else fields
         delay = (length + distance + extra + more) / SPEED_OF_LIGHT
         image = here[frame] + length[:, None] * start  # the last point, unfolded
         ends = (position, image) if from_receiver else (image, position)
-        yield coherent_paths(link, frame, delay, fields, *ends)
+        yield antennas.coherent_paths(link, frame, delay, fields, *ends)
 
 
 def sample_surface_points(areas: Float64[Tensor, " f"], count: int, seed: int) -> SurfacePaths:

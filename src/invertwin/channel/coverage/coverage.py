@@ -21,6 +21,7 @@ from invertwin.channel.em.plane_waves import dot, interpolate_vectors, triangle_
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.specular import trace_paths
 from invertwin.channel.specular.candidates import find_sequences
 from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
@@ -28,12 +29,6 @@ from invertwin.channel.specular.image_method import (
     find_paths_along,
 )
 from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
-from invertwin.channel.specular.trace_paths import (
-    PathScene,
-    evaluate_paths,
-    face_interactions,
-    prepare_path_scene,
-)
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
@@ -118,7 +113,7 @@ def trace_coverage(
             out. Only derivatives with respect to positions use them.
         seed: random seed of rays and edge points.
     """
-    path_scene = prepare_path_scene(scene, tx, points, frequency)
+    path_scene = trace_paths.prepare_path_scene(scene, tx, points, frequency)
     with tracing():
         tracer = _CoverageTracer(path_scene, surface, measure, depth, rays, seed)
         amount = tracer.sum_paths(path_scene, tracer.find_paths(strip_derivatives(path_scene.rx)))
@@ -136,7 +131,7 @@ class _CoverageTracer:
 
     def __init__(
         self,
-        stage: PathScene,
+        stage: trace_paths.PathScene,
         surface: Mesh,
         measure: PathMeasure,
         depth: int,
@@ -144,7 +139,7 @@ class _CoverageTracer:
         seed: int,
     ) -> None:
         self.measure, self.depth = measure, depth
-        self.tx, powers = strip_derivatives(stage.tx), face_interactions(stage)
+        self.tx, powers = strip_derivatives(stage.tx), trace_paths.face_interactions(stage)
         self.powers = powers
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
@@ -166,7 +161,7 @@ class _CoverageTracer:
         return batches
 
     def sum_paths(
-        self, stage: PathScene, batches: list[_PointBatch]
+        self, stage: trace_paths.PathScene, batches: list[_PointBatch]
     ) -> Float64[Tensor, "tx point amount"]:
         """Sum the values of paths at points; derivatives recompute the paths (checkpointing)."""
         recompute = stage.vertices.requires_grad or stage.tx.requires_grad
@@ -175,11 +170,13 @@ class _CoverageTracer:
             rx = stage.rx[rows]
             local = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
-            def total(local: PathScene = local, parts: list[SpecularPaths] = parts) -> Tensor:
+            def total(
+                local: trace_paths.PathScene = local, parts: list[SpecularPaths] = parts
+            ) -> Tensor:
                 count = len(self.tx) * len(local.rx)
                 sums = torch.zeros(count, self.measure.count, dtype=torch.float64)
                 for part in parts:
-                    paths = join_ray_paths(evaluate_paths(local, part))
+                    paths = join_ray_paths(trace_paths.evaluate_paths(local, part))
                     values = self.measure.evaluate(paths, local.tx, local.rx)
                     sums = sums.index_add(0, paths.link, values)
                 return sums.unflatten(0, (len(self.tx), len(local.rx)))
@@ -188,7 +185,7 @@ class _CoverageTracer:
         return torch.cat(found, 1)
 
     def trace_illumination_boundaries(
-        self, stage: PathScene, samples: int, seed: int
+        self, stage: trace_paths.PathScene, samples: int, seed: int
     ) -> list[CoverageBoundaryPaths]:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
@@ -204,7 +201,7 @@ class _CoverageTracer:
             )
             detached = _detach_stage(stage, boundary.point)
             with torch.no_grad():
-                paths = join_ray_paths(evaluate_paths(detached, boundary.paths))
+                paths = join_ray_paths(trace_paths.evaluate_paths(detached, boundary.paths))
                 values = strip_derivatives(self.measure.evaluate(paths, detached.tx, detached.rx))
             # One path a row, in another order.
             amount = torch.zeros_like(values).index_copy(0, paths.rx, values)
@@ -214,7 +211,7 @@ class _CoverageTracer:
         return boundary_paths
 
     def trace_intersection_curves(
-        self, stage: PathScene, samples: int, seed: int
+        self, stage: trace_paths.PathScene, samples: int, seed: int
     ) -> list[CoverageBoundaryPaths]:
         """Boundary paths where the scene intersects the surface: jump of values times area rate."""
         with _DisableFuncTorch():
@@ -240,7 +237,7 @@ class _CoverageTracer:
         ]
 
 
-def _detach_stage(stage: PathScene, points: Tensor) -> PathScene:
+def _detach_stage(stage: trace_paths.PathScene, points: Tensor) -> trace_paths.PathScene:
     """Replace the receivers and detach all positions."""
     return replace(stage, rx=points, rx_velocity=torch.zeros_like(points), velocities=None).detach()
 

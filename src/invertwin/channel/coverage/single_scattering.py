@@ -14,26 +14,19 @@ Source: derivations §3, §10 and §11.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.coherent.radar_equation import (
-    MaterialPoints,
-    SurfacePaths,
-    evaluate_scattering,
-)
-from invertwin.channel.coverage.shadow_boundaries import (
-    ReceivingTriangles,
-    evaluate_illumination_boundary,
-    sample_illumination_boundaries,
-)
+from invertwin.channel.coherent import radar_equation
+from invertwin.channel.coherent.multibounce_po import sample_surface_points
+from invertwin.channel.coverage import shadow_boundaries
 from invertwin.channel.em.plane_waves import dot, triangle_normals
 from invertwin.channel.paths import Link
 from invertwin.channel.rays.backend import tracing
@@ -56,34 +49,55 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.runtime.concurrency import torch_threads
-from invertwin.scene import Isotropic
+from invertwin.scene import Isotropic, Material, ScatteringLaw
 from invertwin.scene.scene import Scene
 
-_POINTS_AT_ONCE = 1 << 14
+POINTS_AT_ONCE = 1 << 14
 _RAYS_PER_POINT = 16  # rays of power paths at the cost of one point
-_PLASTIC_STEPS = 0.754_877_666_246_692_8, 0.569_840_290_998_053_3  # of the R2 sequence
+_BALANCED_SHARE = 0.5  # of the points that all objects get alike, whatever their area
 
 #: Function of paths from transmitters and from receivers to the same points, the depolarised
 #: fraction of power there, and the positions of transmitters and receivers; returns the values that
 #: each pair contributes, ``[pair, amount]``.
 PathPairMeasure = Callable[[RayPaths, RayPaths, Tensor, Tensor, Tensor], Tensor]
 
+Pairing = Literal["all", "frames", "monostatic"]
+"""Antennas that belong together: each transmitter with all receivers, with the receiver of its
+number, or with that one where both share every visibility test (from the transmitter)."""
+
 
 @dataclass(frozen=True)
-class _ScatteringPoints(Rows):
-    """Points on rough surfaces, one row each; detached.
+class ScatteredPairs(Rows):
+    """Pairs of legs from the antennas to the same points of scattering surfaces, one row each.
 
     Attributes:
-        receiver: number of the receiver of each point.
+        outbound, inbound: legs to the point from the transmitter, and from the receiver.
+        weight: (4π/λ)² f |cosθ| |cosθ'| times the area that the point stands for; on a boundary,
+            times the area newly illuminated: zero in value, with its derivative.
+        depolarisation: fraction of the scattered power converted between V and H.
+    """
+
+    outbound: RayPaths
+    inbound: RayPaths
+    weight: Float64[Tensor, " pair"]
+    depolarisation: Float64[Tensor, " pair"]
+
+
+@dataclass(frozen=True)
+class ScatteringPoints(Rows):
+    """Points on scattering surfaces, one row each; detached.
+
+    Attributes:
+        antenna: number of the receiver of each point, or of the pair of antennas.
         points: positions of the points, and the area that each represents.
     """
 
-    receiver: Int64[Tensor, " row"]
-    points: SurfacePaths
+    antenna: Int64[Tensor, " row"]
+    points: radar_equation.SurfacePaths
 
 
 #: Paths to points from transmitters, and from receivers; detached.
-_PathLegs = tuple[list[image_method.SpecularPaths], list[image_method.SpecularPaths]]
+PathLegs = tuple[list[image_method.SpecularPaths], list[image_method.SpecularPaths]]
 
 
 @rename_arguments(rough="scattering_scene", width="value_count")
@@ -124,38 +138,77 @@ def trace_single_scattering(
             that scatters.
     """
     stage = replace(prepare_path_scene(scene, tx, rx, frequency), velocities=None)
+    counts = len(stage.tx), len(stage.rx)
+
+    def sum_links(pairs: ScatteredPairs) -> Tensor:
+        ends = pairs.outbound, pairs.inbound
+        amount = measure(*ends, pairs.depolarisation, stage.tx, stage.rx)
+        link = pairs.outbound.tx * counts[1] + pairs.inbound.tx
+        total = torch.zeros(counts[0] * counts[1], value_count, dtype=torch.float64)
+        return total.index_add(0, link, pairs.weight[:, None] * amount).unflatten(0, counts)
+
     with tracing(sampling.backend), torch_threads(1):
         geometry = flatten(scattering_scene, SPEED_OF_LIGHT / frequency)
-        trace = _SingleScatteringTracer(stage, geometry, measure, value_count, rays, sampling, seed)
-        if not trace.is_scattering.any() or not any(
-            map(len, trace.sequences[0] + trace.sequences[1])
-        ):
-            return torch.zeros(len(stage.tx), len(stage.rx), value_count, dtype=torch.float64)
-        total = trace.sum_interior(stage, geometry)
-        deforms = is_differentiated(stage.vertices)
-        moves = deforms or is_differentiated(stage.tx) or is_differentiated(stage.rx)
-        if sampling.boundary and sampling.boundary_samples and moves:
-            if deforms and sampling.contacts:
-                _require_no_contact(geometry, stage, trace.is_scattering)
-            total = total + trace.sum_boundary(stage, geometry)
-    return total
+        drawn = replace(sampling, samples=max(1, sampling.samples // _RAYS_PER_POINT))
+        tracer = SingleScatteringTracer(stage, geometry, rays, drawn, seed)
+        total = tracer.sum_pairs(stage, geometry, sum_links)
+    return torch.zeros(*counts, value_count, dtype=torch.float64) if total is None else total
 
 
-class _SingleScatteringTracer:
-    """Finds specular legs to rough surfaces and sums the values of their pairs."""
+def without_specular(scene: Scene, names: Collection[str]) -> Scene:
+    """Replace materials by their incoherent part, which scatters and does not mirror.
+
+    Args:
+        scene: scene with the objects.
+        names: names of the objects to replace.
+    """
+    for name in names:
+        scene = scene.replace(name, material=IncoherentMaterial(scene[name].material))
+    return scene
+
+
+@dataclass(frozen=True)
+class IncoherentMaterial(Material):
+    """Scattering of a material without its coherent specular reflection.
+
+    Attributes:
+        base: the material.
+    """
+
+    base: Material
+
+    @property
+    def faces(self) -> int | None:
+        """Number of triangles of its values; None if they hold for any."""
+        return self.base.faces
+
+    def scattering_law(self, frequency: float) -> ScatteringLaw:
+        """Return the incoherent part of the law. See ``Material.incoherent_law``."""
+        return self.base.incoherent_law(frequency)
+
+
+class SingleScatteringTracer:
+    """Finds specular legs to scattering surfaces and sums over their pairs.
+
+    Args:
+        stage: scene that reflects, transmits and occludes, with the antennas.
+        geometry: the same objects with their scattering laws.
+        rays: number of rays of the search for sequences; None tests every one.
+        sampling: as of ``trace_single_scattering``, with one sample for each point.
+        seed: random seed of all samples.
+        pairing: antennas that belong together.
+    """
 
     def __init__(
         self,
         stage: PathScene,
         geometry: Geometry,
-        measure: PathPairMeasure,
-        value_count: int,
         rays: int | None,
         sampling: Sampling,
         seed: int,
+        pairing: Pairing = "all",
     ) -> None:
-        self.measure, self.value_count, self.depth = measure, value_count, sampling.depth
-        self.sampling, self.seed = sampling, seed
+        self.depth, self.sampling, self.seed, self.pairing = sampling.depth, sampling, seed, pairing
         self.antennas = strip_derivatives(stage.tx), strip_derivatives(stage.rx)
         self.powers = face_interactions(stage)
         # Discrete: `torch.func` would claim the intermediate tensors.
@@ -183,83 +236,144 @@ class _SingleScatteringTracer:
         )
         return tuple(steps[:, 1:] for steps in columns if len(steps))
 
-    def sum_interior(self, stage: PathScene, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
+    def sum_pairs(
+        self, stage: PathScene, geometry: Geometry, reduce: Callable[[ScatteredPairs], Tensor]
+    ) -> Tensor | None:
+        """Sum over sampled points, and over boundaries where something moves; None without paths.
+
+        Args:
+            stage: as given, with derivatives.
+            geometry: as given, with derivatives.
+            reduce: sum of the values of some pairs, of one shape whatever their number.
+
+        Raises:
+            InputError: derivatives where a moving surface touches one that scatters.
+        """
+        if not self.is_scattering.any() or not any(map(len, self.sequences[0] + self.sequences[1])):
+            return None
+        total = self._sum_interior(stage, geometry, reduce)
+        deforms, sampling = is_differentiated(stage.vertices), self.sampling
+        moves = deforms or is_differentiated(stage.tx) or is_differentiated(stage.rx)
+        if sampling.boundary and sampling.boundary_samples and moves:
+            if deforms and sampling.contacts:
+                _require_no_contact(geometry, stage, self.is_scattering)
+            for part in self._boundary_pairs(stage, geometry):
+                total = total + reduce(part)
+        return total
+
+    def _sum_interior(
+        self, stage: PathScene, geometry: Geometry, reduce: Callable[[ScatteredPairs], Tensor]
+    ) -> Tensor:
         """Sum over points at fixed visibility; derivatives recompute the paths (checkpointing)."""
         with _DisableFuncTorch():
             vertices = strip_derivatives(geometry.vertices)
-            samples = self._sample_points(replace(geometry, vertices=vertices))
+            samples = self.sample_points(replace(geometry, vertices=vertices))
         recompute = any(t.requires_grad for t in (stage.vertices, stage.tx, stage.rx))
-        total = torch.zeros(len(stage.tx), len(stage.rx), self.value_count, dtype=torch.float64)
-        for rows in torch.arange(len(samples.receiver)).split(_POINTS_AT_ONCE):
+        total: Tensor | float = 0.0
+        for rows in torch.arange(len(samples.antenna)).split(POINTS_AT_ONCE):
             part = samples.select(rows)
-            positions = strip_derivatives(part.points.material_points(geometry)[0].position)
-            face = part.points.face[:, 0]
-            with _DisableFuncTorch():
-                legs = (
-                    self._find_legs(0, positions, None, face),
-                    self._find_legs(1, positions, part.receiver, face),
-                )
+            legs = self.find_legs(part, geometry)
 
-            def sum_part(part: _ScatteringPoints = part, legs: _PathLegs = legs) -> Tensor:
+            def sum_part(part: ScatteringPoints = part, legs: PathLegs = legs) -> Tensor:
                 point = part.points.material_points(geometry)[0]
                 area = part.points.weight * point.jacobian
-                link, _, amount = self._evaluate_pairs(stage, geometry, legs, point, area)
-                return self._sum_links(link, amount)
+                return reduce(self.evaluate_pairs(stage, geometry, legs, point, area)[0])
 
             total = total + (checkpoint(sum_part, use_reentrant=False) if recompute else sum_part())
+        assert isinstance(total, Tensor)
         return total
 
-    def sum_boundary(self, stage: PathScene, geometry: Geometry) -> Float64[Tensor, "tx rx amount"]:
-        """Sum over the moving boundaries of illuminated regions; zero in value."""
-        samples, receivers = self.sampling.boundary_samples, len(stage.rx)
-        total = torch.zeros(len(stage.tx), receivers, self.value_count, dtype=torch.float64)
+    def _boundary_pairs(self, stage: PathScene, geometry: Geometry) -> Iterator[ScatteredPairs]:
+        """Pairs at the moving boundaries of illuminated regions; zero in value."""
+        antennas, paired = len(stage.rx), self.pairing != "all"
         corners = stage.vertices[stage.topology.faces]
-        for end, count in enumerate((samples, -(-samples // receivers))):
+        for end in range(1 if self.pairing == "monostatic" else 2):
+            count = -(-self.sampling.boundary_samples // (antennas if end or paired else 1))
             with _DisableFuncTorch():
-                receiver, depth = ReceivingTriangles(self.is_scattering), self.depth - 1
+                receiver, depth = (
+                    shadow_boundaries.ReceivingTriangles(self.is_scattering),
+                    self.depth - 1,
+                )
                 search = receiver, self.antennas[end], self.sequences[end], self.powers
-                samples_by_length = sample_illumination_boundaries(
+                samples_by_length = shadow_boundaries.sample_illumination_boundaries(
                     self.surfaces, *search, depth=depth, samples=count, seed=self.seed + 2 + end
                 )
             for boundary_samples in samples_by_length:
                 moving = (stage.tx, stage.rx)[end], stage.vertices
-                boundary = evaluate_illumination_boundary(
+                boundary = shadow_boundaries.evaluate_illumination_boundary(
                     self.surfaces, corners, boundary_samples, *moving
                 )
                 if not len(boundary.face):
                     continue
+                own, spread = [boundary.paths], 1.0
                 with _DisableFuncTorch():
-                    # Boundary points of a transmitter are assigned to the receivers in turn.
-                    receiver = None if end else boundary.edge_point % receivers
-                    other_legs = self._find_legs(1 - end, boundary.point, receiver, boundary.face)
-                legs = (other_legs, [boundary.paths]) if end else ([boundary.paths], other_legs)
-                with torch.no_grad():
-                    point = _material_points_at(geometry, boundary.point, boundary.face)
-                    area = torch.full((len(boundary.face),), 1.0 if end else receivers).double()
-                    found = self._evaluate_pairs(stage.detach(), geometry, legs, point, area)
-                link, index, amount = found
-                amount = strip_derivatives(amount) * boundary.area_rate[index, None]
-                total = total + self._sum_links(link, amount)
-        return total
+                    antenna = boundary.paths.source if paired else None
+                    if not end and not paired:
+                        # Boundary points of a transmitter are assigned to the receivers in turn.
+                        antenna, spread = boundary.edge_point % antennas, float(antennas)
+                    where = boundary.point, antenna, boundary.face
+                    shared = self.pairing == "monostatic"
+                    others = self._find_legs(0 if shared else 1 - end, *where)
+                    if shared:
+                        # One boundary of both legs: it passes with each other leg, and with itself.
+                        others = [self._drop_same(part, boundary.paths) for part in others]
+                both: list[PathLegs] = [(own, [*others, *own] if shared else others)]
+                both += [(others, own)] if shared else []
+                for legs in both:
+                    with torch.no_grad():
+                        point = _material_points_at(geometry, boundary.point, boundary.face)
+                        area = torch.full((len(boundary.face),), spread).double()
+                        ordered = (legs[1], legs[0]) if end else legs
+                        found = self.evaluate_pairs(stage.detach(), geometry, ordered, point, area)
+                    pairs, index = found
+                    weight = strip_derivatives(pairs.weight) * boundary.area_rate[index]
+                    yield replace(pairs, weight=weight)
 
-    def _sample_points(self, geometry: Geometry) -> _ScatteringPoints:
-        """Sample points evenly over all scattering surfaces, equally many for each receiver."""
-        receivers = len(self.antennas[1])
-        count = max(1, self.sampling.samples // (_RAYS_PER_POINT * receivers))
-        cumulative_area = (face_areas(geometry) * self.is_scattering).cumsum(0)
-        generator = np.random.default_rng(np.random.SeedSequence([self.seed, 4]))
-        shift, jitter = (torch.from_numpy(generator.random((k, receivers, 1))) for k in (2, 1))
-        index = torch.arange(count)
-        cumulative = ((index + jitter[0]) / count * cumulative_area[-1]).flatten()
-        face = torch.searchsorted(cumulative_area, cumulative, right=True)
-        face = face.clamp_max(int(torch.nonzero(self.is_scattering)[-1]))
-        steps = zip(shift, _PLASTIC_STEPS, strict=True)
-        b1, b2 = (((start + index * step) % 1).flatten() for start, step in steps)
-        is_outside = b1 + b2 > 1
-        b1, b2 = torch.where(is_outside, 1 - b1, b1), torch.where(is_outside, 1 - b2, b2)
-        weight = torch.full_like(cumulative, float(cumulative_area[-1]) / count)
-        points = SurfacePaths(face[:, None], b1[:, None], b2[:, None], weight, 0 * weight)
-        return _ScatteringPoints(torch.arange(receivers).repeat_interleave(count), points)
+    def _drop_same(
+        self, legs: image_method.SpecularPaths, own: image_method.SpecularPaths
+    ) -> image_method.SpecularPaths:
+        """Legs to points on boundaries without those whose boundary it is."""
+        if legs.faces.shape[1] != own.faces.shape[1]:
+            return legs
+        plane = self.surfaces.planes.face_plane
+        same = plane[legs.faces] == plane[own.faces[legs.target]]
+        same &= legs.transmitted == own.transmitted[legs.target]
+        return legs.select(~same.all(1))
+
+    def sample_points(self, geometry: Geometry) -> ScatteringPoints:
+        """Sample points on all scattering surfaces, equally many for each receiver.
+
+        Half of them are spread evenly, and half get every object alike, so that a small one beside
+        a large wall has some.
+
+        Args:
+            geometry: surfaces, detached.
+        """
+        areas, owner = face_areas(geometry) * self.is_scattering, geometry.face_object
+        owned = torch.zeros(len(geometry.names), dtype=torch.float64).index_add(0, owner, areas)
+        even, alike = 1 / areas.sum(), 1 / (owned.clamp_min(1e-300) * (owned > 0).sum())[owner]
+        density = (1 - _BALANCED_SHARE) * even + _BALANCED_SHARE * alike
+        antennas = len(self.antennas[1])
+        count = max(1, self.sampling.samples // antennas) * antennas
+        points = sample_surface_points(areas * density, count, self.seed)
+        weight = points.weight * antennas / density[points.face[:, 0]]
+        return ScatteringPoints(torch.arange(count) % antennas, replace(points, weight=weight))
+
+    def find_legs(self, part: ScatteringPoints, geometry: Geometry) -> PathLegs:
+        """Find the legs of both ends to points, at fixed visibility.
+
+        Args:
+            part: points.
+            geometry: triangles of the points.
+        """
+        with _DisableFuncTorch():
+            position = strip_derivatives(part.points.material_points(geometry)[0].position)
+            face = part.points.face[:, 0]
+            antenna = None if self.pairing == "all" else part.antenna
+            outbound = self._find_legs(0, position, antenna, face)
+            if self.pairing == "monostatic":
+                return outbound, outbound
+            return outbound, self._find_legs(1, position, part.antenna, face)
 
     def _find_legs(
         self, end: int, points: Tensor, receiver: Int64[Tensor, " row"] | None, face: Tensor
@@ -282,15 +396,26 @@ class _SingleScatteringTracer:
                     found.append(replace(part, source=used[part.source]).select(valid))
         return found
 
-    def _evaluate_pairs(
+    def evaluate_pairs(
         self,
         stage: PathScene,
         geometry: Geometry,
-        path_legs: _PathLegs,
-        point: MaterialPoints,
+        path_legs: PathLegs,
+        point: radar_equation.MaterialPoints,
         area: Float64[Tensor, " row"],
-    ) -> tuple[Tensor, Tensor, Float64[Tensor, "pair amount"]]:
-        """Pairs of legs to the same points: link, point, and values times an area of the point."""
+    ) -> tuple[ScatteredPairs, Int64[Tensor, " pair"]]:
+        """Pair the legs to the same points on one side, with a reflection on one of them.
+
+        Args:
+            stage: scene and antennas.
+            geometry: surfaces with their scattering laws.
+            path_legs: legs to the points, as of ``find_legs``.
+            point: the points.
+            area: area that each stands for [m²].
+
+        Returns:
+            The pairs, and the number of the point of each.
+        """
         outbound, inbound = (
             join_ray_paths([part for some in legs for part in evaluate_paths(material, some)])
             for material, legs in zip(
@@ -300,9 +425,9 @@ class _SingleScatteringTracer:
             )
         )
         first, second = match_rows(outbound.rx, inbound.rx, len(area))
-        pairs, normal = ((outbound, first), (inbound, second)), strip_derivatives(point.normal)
-        side = [dot(normal[leg.rx], strip_derivatives(leg.arrival))[n] > 0 for leg, n in pairs]
-        has_reflection = [(leg.kinds == REFLECTION).any(1)[n] for leg, n in pairs]
+        ends, normal = ((outbound, first), (inbound, second)), strip_derivatives(point.normal)
+        side = [dot(normal[leg.rx], strip_derivatives(leg.arrival))[n] > 0 for leg, n in ends]
+        has_reflection = [(leg.kinds == REFLECTION).any(1)[n] for leg, n in ends]
         kept = outbound.depth[first] + inbound.depth[second] < self.depth
         kept &= (has_reflection[0] | has_reflection[1]) & (side[0] == side[1])
         rows = torch.nonzero(kept)[:, 0]
@@ -310,17 +435,44 @@ class _SingleScatteringTracer:
         index = outbound.rx
         material = point.select(index)
         k = 4 * math.pi * stage.frequency / SPEED_OF_LIGHT
-        law = evaluate_scattering(geometry, material, outbound.arrival, inbound.arrival)
-        law = k**2 * area[index] * law
+        law = radar_equation.evaluate_scattering(
+            geometry, material, outbound.arrival, inbound.arrival
+        )
         chi = geometry.surfaces.depolarisation[material.row]
-        amount = law[:, None] * self.measure(outbound, inbound, chi, stage.tx, stage.rx)
-        return outbound.tx * len(self.antennas[1]) + inbound.tx, index, amount
+        return ScatteredPairs(outbound, inbound, k**2 * area[index] * law, chi), index
 
-    def _sum_links(self, link: Tensor, amount: Tensor) -> Float64[Tensor, "tx rx amount"]:
-        """Sum the values of the pairs of each link."""
-        counts = [len(places) for places in self.antennas]
-        total = torch.zeros(counts[0] * counts[1], self.value_count, dtype=torch.float64)
-        return total.index_add(0, link, amount).unflatten(0, counts)
+
+def scattered_power(
+    outbound: RayPaths,
+    inbound: RayPaths,
+    sent: Complex128[Tensor, "pair t 2"],
+    received: Complex128[Tensor, "pair r 2"],
+    depolarisation: Float64[Tensor, " pair"],
+) -> Float64[Tensor, " pair"]:
+    """Power that arrives by pairs of legs from a scatterer of unit weight.
+
+    It is the mean over the elements of both antennas.
+
+    Args:
+        outbound, inbound: legs to the scatterer from the transmitter, and from the receiver.
+        sent: amplitudes of the transmitter's elements along the legs, in V and H.
+        received: those of the receiver's.
+        depolarisation: fraction of the power that the scatterer converts between V and H.
+    """
+    ends = _stokes(outbound, sent), _stokes(inbound, received)
+    whole, q, u, v = (0.5 * ends[0] * ends[1]).unbind(1)
+    return whole + (1 - 2 * depolarisation) * (q + u) - (1 - 4 * depolarisation) * v
+
+
+def _stokes(
+    legs: RayPaths, fields: Complex128[Tensor, "path element 2"]
+) -> Float64[Tensor, "path 4"]:
+    """Mean Stokes parameters, over the elements of an antenna, at the far ends of legs."""
+    field = torch.einsum("pij,pej->pei", legs.coefficient, fields)
+    power = torch.view_as_real(field).square().sum(-1)
+    both = field[..., 0] * field[..., 1].conj()
+    first, second = power.unbind(-1)
+    return torch.stack([first + second, first - second, 2 * both.real, 2 * both.imag], -1).mean(1)
 
 
 def _replace_antennas(stage: PathScene, tx: Tensor, rx: Tensor) -> PathScene:
@@ -331,11 +483,11 @@ def _replace_antennas(stage: PathScene, tx: Tensor, rx: Tensor) -> PathScene:
 
 def _material_points_at(
     geometry: Geometry, position: Float64[Tensor, "row 3"], face: Tensor
-) -> MaterialPoints:
+) -> radar_equation.MaterialPoints:
     """Material points on triangles for the scattering law; at rest."""
     normal = triangle_normals(strip_derivatives(geometry.vertices)[geometry.faces[face]])
     one = torch.ones_like(position[:, 0])
-    return MaterialPoints(position, normal, one, geometry.face_surface[face])
+    return radar_equation.MaterialPoints(position, normal, one, geometry.face_surface[face])
 
 
 def _require_no_contact(

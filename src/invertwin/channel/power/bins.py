@@ -309,6 +309,8 @@ def deposit_paths(paths: Paths, link: Link, grid: Grid) -> Float32[Tensor, "fram
 
     Source: derivations §5.
     """
+    if not len(paths):
+        return torch.zeros(link.frame_count, *grid.shape)
     u, v = paths.direction_cosines(link).unbind(1)
     with tracing():
         layout = BinLayout.from_link(grid, link)

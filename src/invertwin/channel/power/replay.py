@@ -15,15 +15,10 @@ from functools import partial
 from typing import Any, TypeVar
 
 from invertwin.channel.power import integrand
+from invertwin.channel.power import transmission as sheets
 from invertwin.channel.power.bins import FourFloats, PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.random_walk import PathRecords, PathVertex
-from invertwin.channel.power.transmission import (
-    Carry,
-    SegmentTransmission,
-    trace_transmission,
-    visit_sheets,
-)
 from invertwin.channel.rays.arrays import opaque
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
@@ -70,7 +65,7 @@ class _VertexFactors:
     connection: integrand.AntennaConnection
     polarisation_factor: mit.Float
     scattering_factor: mit.Float
-    transmission: SegmentTransmission
+    transmission: sheets.SegmentTransmission
     shares_segment: mit.Bool
     endpoints: tuple[Position, Position, Position]
 
@@ -198,12 +193,12 @@ def _evaluate_vertex(
         )
     assert vertex.is_visible is not None
     visible = active & vertex.is_visible
-    twice, passed = mi.Bool(False), SegmentTransmission.clear()
+    twice, passed = mi.Bool(False), sheets.SegmentTransmission.clear()
     if inputs.surfaces.has_sheets:
         twice = first if rays.link.shared_visibility else twice
         ends = dr.detach(here.position), dr.detach(dr.select(twice, before, receiver.position))
         with dr.suspend_grad():
-            passed = trace_transmission(rays, inputs.detach(), *ends, visible)
+            passed = sheets.trace_transmission(rays, inputs.detach(), *ends, visible)
 
     def locate_attached() -> SurfaceInteraction | None:
         previous = neighbours.previous
@@ -439,11 +434,11 @@ def _pull_sheets(
     again = [dr.select(vertex.shares_segment, amount, 0.0) for amount in own]
 
     def pull_segment(start: Position, active: mit.Bool, sums: Sums) -> None:
-        def act(_: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
+        def act(_: sheets.Carry, transmittance: mit.Float, extra: mit.Float) -> None:
             factor = _log_derivative_factor(dr.detach(transmittance) > 0, sums[0], transmittance)
             dr.backward_from(factor * transmittance + sums[1] * extra)
 
-        visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
+        sheets.visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
 
     sums = sums[0] + again[0], sums[1] + again[1]
     pull_segment(vertex.endpoints[0], vertex.active, sums)
@@ -510,7 +505,7 @@ def _push_sheets(
 ) -> Sums:
     """Compute the tangents of the logarithmic transmittance and of the extra length [m]."""
 
-    def act(carry: Carry, transmittance: mit.Float, extra: mit.Float) -> None:
+    def act(carry: sheets.Carry, transmittance: mit.Float, extra: mit.Float) -> None:
         tangents = dr.forward_to(transmittance, extra, flags=dr.ADFlag.ClearEdges)
         carry["growth"] = carry["growth"] + _log_derivative_factor(
             dr.detach(transmittance) > 0, dr.detach(tangents[0]), transmittance
@@ -518,7 +513,7 @@ def _push_sheets(
         carry["longer"] = carry["longer"] + dr.detach(tangents[1])
 
     zero = {name: dr.zeros(mi.Float, dr.width(active)) for name in ("growth", "longer")}
-    done, _ = visit_sheets(rays, inputs, start, end, active, zero, act)
+    done, _ = sheets.visit_sheets(rays, inputs, start, end, active, zero, act)
     return done["growth"], done["longer"]
 
 

@@ -13,13 +13,8 @@ import numpy as np
 
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
+from invertwin.channel.power import transmission as sheets
 from invertwin.channel.power.integrand import Inputs
-from invertwin.channel.power.transmission import (
-    STRATIFIED_SHEETS,
-    SegmentTransmission,
-    trace_to_surface,
-    trace_transmission,
-)
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres
@@ -45,7 +40,7 @@ class StartPoints:
     frame: mit.UInt32
     point: SurfacePoint
     weight: mit.Float
-    transmission: SegmentTransmission
+    transmission: sheets.SegmentTransmission
 
 
 class RaySampler:
@@ -103,7 +98,9 @@ class RaySampler:
         centre = arrays.gather_points(rays.tx, frame)
         ray, key = mi.Ray3f(centre, direction), (index, self.transmission_seed)
         bits = _stratified_bits(column, row)
-        hit = trace_to_surface(rays, inputs, ray, every, key, coherent=True, stratified_bits=bits)
+        hit = sheets.trace_to_surface(
+            rays, inputs, ray, every, key, coherent=True, stratified_bits=bits
+        )
         point = integrand.compute_interaction(inputs, hit.point)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
@@ -115,7 +112,7 @@ class RaySampler:
 def _stratified_bits(column: mit.UInt32, row: mit.UInt32) -> mit.UInt32:
     """Compute bits that split a grid into halves as even as itself, repeatedly."""
     bits = mi.UInt32(0)
-    for k in range(STRATIFIED_SHEETS // 2):
+    for k in range(sheets.STRATIFIED_SHEETS // 2):
         x, y = column >> k, row >> k
         bits |= (((x ^ y) & 1) | ((y & 1) << 1)) << (2 * k)
     return bits
@@ -168,6 +165,6 @@ class AreaSampler:
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = interpolate_position(triangle, b.x, b.y)
         tx = arrays.gather_points(rays.tx, frame)
-        passed = trace_transmission(rays, inputs, tx, position, mi.Bool(True))
+        passed = sheets.trace_transmission(rays, inputs, tx, position, mi.Bool(True))
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
         return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

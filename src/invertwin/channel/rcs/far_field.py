@@ -29,15 +29,7 @@ from invertwin.channel.beams.beam_tracing import (
     trace_beams,
 )
 from invertwin.channel.em import dielectric_solids, plane_waves
-from invertwin.channel.em.wedges import (
-    MIN_EDGE_ANGLE,
-    Wedges,
-    find_wedges,
-    fringe_field,
-    is_grazing_sheet,
-    is_outside_wedge,
-    select_body_edges,
-)
+from invertwin.channel.em import wedges as wedge_geometry
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
@@ -123,15 +115,19 @@ class _FarFieldTarget:
         return max([1.0, *(float(refractive_index(e.detach())) for e in inside)])
 
     @cached_property
-    def sharp_edges(self) -> Wedges:
+    def sharp_edges(self) -> wedge_geometry.Wedges:
         """Sharp edges of conductors."""
         ends = self.vertices[self.topology.edges]
-        wedges = find_wedges(self.facets.corners, ends, self.topology.edge_faces)
+        wedges = wedge_geometry.find_wedges(self.facets.corners, ends, self.topology.edge_faces)
         wedges = wedges.select(self.interfaces[0].conducting[wedges.faces[:, 0]])
-        return wedges.select(select_body_edges(wedges, self.wavelength * _MIN_EDGE_RUN))
+        return wedges.select(
+            wedge_geometry.select_body_edges(wedges, self.wavelength * _MIN_EDGE_RUN)
+        )
 
     @cached_property
-    def edge_pieces(self) -> tuple[Wedges, Float64[Tensor, "row 3"], Float64[Tensor, "row 2"]]:
+    def edge_pieces(
+        self,
+    ) -> tuple[wedge_geometry.Wedges, Float64[Tensor, "row 3"], Float64[Tensor, "row 2"]]:
         """Pieces of sharp edges, their middles, and the widths of both faces across each [m]."""
         pieces = _split_edges(self.sharp_edges, self.wavelength / _SEGMENTS_PER_WAVELENGTH)
         middle, bodies = (pieces.start + pieces.end) / 2, (self.facets, self.occluders)
@@ -369,8 +365,8 @@ class _FarFieldTracer:
             for antennas in (self.transmitters, self.receivers):
                 direction = antennas[aspect]
                 pieces = wedges.select(row)
-                keep = is_outside_wedge(pieces, direction)
-                grazing = keep & is_grazing_sheet(pieces, direction)
+                keep = wedge_geometry.is_outside_wedge(pieces, direction)
+                grazing = keep & wedge_geometry.is_grazing_sheet(pieces, direction)
                 left_out += int(grazing.sum())
                 aspect, row = aspect[keep & ~grazing], row[keep & ~grazing]
             for antennas in (self.transmitters, self.receivers):
@@ -386,15 +382,16 @@ class _FarFieldTracer:
             centre, side = middle[row], pieces.end - pieces.start
             field, widths = self._incident_fields[aspect], strip_widths[row]
             for f, k in enumerate(target.wave_numbers):
-                radiated = fringe_field(pieces, k, d, field, s, widths)
+                radiated = wedge_geometry.fringe_field(pieces, k, d, field, s, widths)
                 wave = k * (s - d)
                 width = plane_waves.parallelogram_integral(wave, side, torch.zeros_like(side))
                 scale = plane_waves.phasor(plane_waves.dot(wave, centre)) * width * side.norm(dim=1)
                 total[f] = self._add_received(total[f], aspect, radiated * scale[:, None, None])
         if left_out:
             warnings.warn(
-                f"edges of sheets within {math.degrees(MIN_EDGE_ANGLE):.0f}° of grazing are left "
-                "out: their fringe currents are not valid there, and physical optics is not either",
+                f"edges of sheets within {math.degrees(wedge_geometry.MIN_EDGE_ANGLE):.0f}° of "
+                "grazing are left out: their fringe currents are not valid there, and physical "
+                "optics is not either",
                 PhysicsWarning,
                 stacklevel=2,
             )
@@ -443,7 +440,7 @@ def _residual_field(
     return torch.stack([rest.get(f, torch.zeros_like(modelled[f])) for f in range(len(modelled))])
 
 
-def _split_edges(wedges: Wedges, max_length: float) -> Wedges:
+def _split_edges(wedges: wedge_geometry.Wedges, max_length: float) -> wedge_geometry.Wedges:
     """Split edges into equal pieces no longer than a length."""
     side = wedges.end - wedges.start
     pieces = (side.detach().norm(dim=1) / max_length).ceil().long().clamp_min(1)

@@ -33,12 +33,7 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
 )
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
-from invertwin.channel.rcs.shooting_bouncing_rays import (
-    inset_points,
-    ray_offset,
-    split_large_triangles,
-    subdivide_triangles,
-)
+from invertwin.channel.rcs import shooting_bouncing_rays
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
@@ -201,7 +196,7 @@ def _launch_inner_tubes(
         extent = dot(sides, turns).abs() - width[piece] * turns.norm(dim=2)
         return (extent > _MIN_COSINE * width[piece]).any(1)
 
-    piece, corners = split_large_triangles(own.polygon, is_wide)
+    piece, corners = shooting_bouncing_rays.split_large_triangles(own.polygon, is_wide)
     d = own.direction[piece, None]
     phases = (dot(corners, d) + own.phase_offset[piece, None]).to(torch.complex128)
     area = dot(area_vector(corners), d[:, 0]).abs()
@@ -261,7 +256,9 @@ def _trace_tubes(
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])
-        starts = (points + ray_offset(facets, left.normal[row])[:, None]).flatten(0, 1)
+        starts = (
+            points + shooting_bouncing_rays.ray_offset(facets, left.normal[row])[:, None]
+        ).flatten(0, 1)
         medium, ways = left.medium[many], directions_at(row, points).flatten(0, 1)
         return _find_first_facets(facets, occluders, solids, medium, starts, ways).view(shape)
 
@@ -272,10 +269,12 @@ def _trace_tubes(
     def is_narrow(_: Tensor, pieces: Tensor) -> Tensor:
         return (pieces.roll(-1, 1) - pieces).norm(dim=2).amax(1) <= min_tube_width
 
-    row, corners, face = subdivide_triangles(departing.corners, visible_faces, is_narrow)
+    row, corners, face = shooting_bouncing_rays.subdivide_triangles(
+        departing.corners, visible_faces, is_narrow
+    )
     keep = (face >= 0) & _has_area(facets, corners)
     row, corners, face = row[keep], corners[keep], face[keep]
-    hit = hit_facets(row, inset_points(corners))
+    hit = hit_facets(row, shooting_bouncing_rays.inset_points(corners))
     is_other_face = (hit < 0) | (surface.face[hit.clamp_min(0)] != face[:, None])
     # A split piece sees its face at least from its centre.
     is_valid = (~is_other_face).any(1)
@@ -308,7 +307,7 @@ def _find_first_facets(
         if not len(row):
             break
         beyond = (along[row] * far)[:, None] * directions[row]
-        beyond = beyond + 2 * ray_offset(facets, directions[row])
+        beyond = beyond + 2 * shooting_bouncing_rays.ray_offset(facets, directions[row])
         origins = origins.index_copy(0, row, origins[row] + beyond)
         ends = origins[row] + far * directions[row]
         again, along_again = find_next_surface(occluders, origins[row], ends)

@@ -20,13 +20,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.em.utd import DyadDerivative, EdgeDiffraction, diffraction_dyads
 from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
-from invertwin.channel.specular.edge_path_geometry import (
-    EdgePaths,
-    PathEdge,
-    Route,
-    find_route,
-    transfer_dyads,
-)
+from invertwin.channel.specular import edge_path_geometry
 
 _MIN_SQUARED_SINE = 1e-18  # sin² of angles below this is zero
 
@@ -53,13 +47,13 @@ def face_weight(
 
 
 def diffract_round_corner(
-    edges: Sequence[PathEdge],
+    edges: Sequence[edge_path_geometry.PathEdge],
     end: Int64[Tensor, " row"],
     faces: Int64[Tensor, "row 2"],
     tx: Float64[Tensor, "row 3"],
     rx: Float64[Tensor, "row 3"],
     wave_number: float,
-) -> EdgePaths:
+) -> edge_path_geometry.EdgePaths:
     """Diffract the field of the last edge but one, near its end, at the last edge.
 
     The last edge starts at this end, the corner.     With X the wave of the edges before, in the
@@ -81,7 +75,7 @@ def diffract_round_corner(
         wave_number: wave number k [1/m].
     """
     before, last = edges[:-1], edges[-1]
-    route, row = find_route(before, tx, rx), torch.arange(len(end))
+    route, row = edge_path_geometry.find_route(before, tx, rx), torch.arange(len(end))
     wedges, first = before[-1].wedges, route.edge_diffractions(wave_number)
     gap, root = (each[row, end] for each in route.end_distances(len(before) - 1, wave_number))
     corner = torch.where(end[:, None] > 0, wedges.end, wedges.start)
@@ -95,7 +89,7 @@ def diffract_round_corner(
     angles, reduced = (last.azimuth_in, exterior_azimuth(last.wedges, leg, 0)), length * sine**2
     final = EdgeDiffraction(last.wedges, leg, leg, *angles, reduced, last.face_coefficients)
     orders: tuple[DyadDerivative, ...] = ("value", "out") if len(before) == 1 else ("value",)
-    fields = transfer_dyads(route, first, wave_number, orders)
+    fields = edge_path_geometry.transfer_dyads(route, first, wave_number, orders)
     dyads = diffraction_dyads(final, wave_number, ("value", "in"))
     transfer = dyads[0] @ fields[0]
     if len(fields) > 1:
@@ -110,11 +104,15 @@ def diffract_round_corner(
     weight = 0.5 * weight * face_weight(wedges, last.wedges, faces, leg) / length.sqrt()
     points = torch.cat([route.points, corner[:, None]], 1)
     transfer = transfer * weight[:, None, None]
-    return EdgePaths(points, route.legs.sum(1), transfer, route.stationary)
+    return edge_path_geometry.EdgePaths(points, route.legs.sum(1), transfer, route.stationary)
 
 
 def _deficit_weight(
-    route: Route, end: Tensor, last: Wedges, end_distance: Tensor, wave_number: float
+    route: edge_path_geometry.Route,
+    end: Tensor,
+    last: Wedges,
+    end_distance: Tensor,
+    wave_number: float,
 ) -> Float64[Tensor, " row"]:
     """Weight 1/(1 + x³), from the triangle along the face between the point and the last edge."""
     wedges = route.edges[-1].wedges

@@ -8,7 +8,7 @@ and the target (``specular.trace_paths``).
 import math
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.antenna_fields import antenna_fields, coherent_paths
@@ -89,30 +89,46 @@ def _echo_paths(
     link: Link, frame: int, outbound: RayPaths, inbound: RayPaths, strength: Tensor
 ) -> Paths:
     """Echo of each pair of legs, both given from their antenna to the target."""
-    # Reciprocity: the matrix of an inbound leg is the transpose.
-    transmit = _antenna_amplitudes(link, frame, outbound, transmits=True)
-    receive = _antenna_amplitudes(link, frame, inbound, transmits=False)
-    outgoing = torch.einsum("nij,ntj->nti", outbound.coefficient, transmit)
-    returning = torch.einsum("nij,nrj->nri", inbound.coefficient, receive)
+    numbers = torch.full((len(outbound),), frame)
+    outgoing = fields_at_target(link, numbers, outbound, transmits=True)
+    returning = fields_at_target(link, numbers, inbound, transmits=False)
     # The target preserves the field vector in world axes.
-    arrives, leaves = _polarisation_axes(outbound.arrival), _polarisation_axes(inbound.arrival)
-    rotation = torch.einsum("nix,njx->nij", leaves, arrives).to(outgoing.dtype)
-    matrix = torch.einsum("nri,nij,ntj->nrt", returning, rotation, outgoing)
-    matrix = matrix * strength[outbound.rx][:, None, None]
+    matrix = returning @ outgoing.mT * strength[outbound.rx][:, None, None]
     # Array elements see the target at its image.
     first = link.tx[frame] + outbound.length[:, None] * outbound.departure
     last = link.rx[frame] + inbound.length[:, None] * inbound.departure
-    numbers, delay = torch.full((len(outbound),), frame), outbound.delay + inbound.delay
-    return coherent_paths(link, numbers, delay, matrix, first, last)
+    return coherent_paths(link, numbers, outbound.delay + inbound.delay, matrix, first, last)
 
 
-def _antenna_amplitudes(
-    link: Link, frame: int, legs: RayPaths, *, transmits: bool
+def fields_at_target(
+    link: Link, frame: Int64[Tensor, " row"], legs: RayPaths, *, transmits: bool
+) -> Complex128[Tensor, "row k 3"]:
+    """Fields that an antenna's vectors radiate to the ends of legs, in world axes.
+
+    By reciprocity, also those that it receives from there.
+
+    Args:
+        link: antennas.
+        frame: radar pose of each leg.
+        legs: from the antenna to its target.
+        transmits: True for the transmitter, False for the receiver.
+    """
+    amplitudes = antenna_amplitudes(link, frame, legs, transmits=transmits)
+    axes = _polarisation_axes(legs.arrival).to(amplitudes.dtype)
+    return torch.einsum("nij,nkj,nix->nkx", legs.coefficient, amplitudes, axes)
+
+
+def antenna_amplitudes(
+    link: Link, frame: Int64[Tensor, " row"], legs: RayPaths, *, transmits: bool
 ) -> Complex128[Tensor, "row k 2"]:
-    """Field amplitudes of an antenna's vectors along legs, in V and H of ``RayPaths``."""
+    """Field amplitudes of an antenna's vectors along legs, in V and H of ``RayPaths``.
+
+    Args:
+        link, frame, legs, transmits: as of ``fields_at_target``.
+    """
     pattern = link.tx_pattern if transmits else link.rx_pattern
     jones = link.tx_jones if transmits else link.rx_jones
-    rotation = link.rotations[frame].expand(len(legs), 3, 3)
+    rotation = link.rotations[frame]
     gain = pattern.gain(torch.einsum("nij,ni->nj", rotation, legs.departure))
     positive = gain > 0  # the square root has no derivative at zero
     strength = torch.where(positive, torch.where(positive, gain, 1.0).sqrt(), 0.0)

@@ -19,12 +19,7 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.utils.checkpoint import checkpoint
 
-from invertwin.channel.em.plane_waves import (
-    dot,
-    interpolate_vectors,
-    plane_of_incidence,
-    polarisations,
-)
+from invertwin.channel.em import plane_waves
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import require_surfaces, vertex_velocities
 from invertwin.channel.rays.topology import Topology, topology_of
@@ -292,7 +287,9 @@ def _diffracted_columns(
     ways = found.directions.unbind(1)
     departure, arrival = ways[0], -ways[-1]
     up = torch.tensor(_UP, dtype=torch.float64)
-    sent, received = (polarisations(way, up).to(found.transfer) for way in (departure, arrival))
+    sent, received = (
+        plane_waves.polarisations(way, up).to(found.transfer) for way in (departure, arrival)
+    )
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
@@ -320,14 +317,14 @@ def _doppler_shifts(
     faces: Int64[Tensor, "path vertex"],
 ) -> Float64[Tensor, " path"]:
     """Doppler shifts [Hz], from the rate at which path lengths decrease."""
-    rate = dot(directions[0], path_scene.tx_velocity[tx])
-    rate = rate - dot(directions[-1], path_scene.rx_velocity[rx])
+    rate = plane_waves.dot(directions[0], path_scene.tx_velocity[tx])
+    rate = rate - plane_waves.dot(directions[-1], path_scene.rx_velocity[rx])
     if path_scene.velocities is not None and faces.shape[1]:
         triangles = path_scene.topology.faces[faces]
         corners, speeds = path_scene.vertices[triangles], path_scene.velocities[triangles]
-        moved = interpolate_vectors(speeds, corners, vertices)
+        moved = plane_waves.interpolate_vectors(speeds, corners, vertices)
         for step in range(faces.shape[1]):
-            rate = rate + dot(directions[step + 1] - directions[step], moved[:, step])
+            rate = rate + plane_waves.dot(directions[step + 1] - directions[step], moved[:, step])
     return path_scene.frequency / SPEED_OF_LIGHT * rate
 
 
@@ -373,25 +370,25 @@ def _transfer_matrix(
 ) -> Complex128[Tensor, "path 2 2"]:
     """Polarisation transfer matrix between V and H at both ends, without spreading."""
     up = torch.tensor(_UP, dtype=torch.float64)
-    before = polarisations(directions[0], up)
+    before = plane_waves.polarisations(directions[0], up)
     matrix = torch.eye(2, dtype=torch.complex128).expand(len(before), 2, 2)
-    cosine = dot(torch.stack(directions, 1)[:, :-1], normal).abs()
+    cosine = plane_waves.dot(torch.stack(directions, 1)[:, :-1], normal).abs()
     found = _face_coefficients(path_scene, paths.faces.ravel(), cosine.ravel())
     r_s, r_p, t_s, t_p = (value.view(paths.faces.shape).unbind(1) for value in found)
     for step, passing in enumerate(paths.transmitted.unbind(1)):
-        across, into, out = plane_of_incidence(normal[:, step], directions[step])
+        across, into, out = plane_waves.plane_of_incidence(normal[:, step], directions[step])
         through = passing[:, None]
         matrix = _change_of_basis(torch.cat([across, into], 1), before) @ matrix
         mirrors = torch.stack([r_s[step], r_p[step]], 1)
         passes = torch.stack([t_s[step], t_p[step]], 1)
         matrix = torch.where(through, passes, mirrors)[..., None] * matrix
         before = torch.cat([across, torch.where(through[..., None], into, out)], 1)
-    return _change_of_basis(polarisations(-directions[-1], up), before) @ matrix
+    return _change_of_basis(plane_waves.polarisations(-directions[-1], up), before) @ matrix
 
 
 def _change_of_basis(new: Tensor, old: Tensor) -> Tensor:
     """Matrix from components along two unit vectors to components along two others."""
-    return dot(new[:, :, None], old[:, None]).to(torch.complex128)
+    return plane_waves.dot(new[:, :, None], old[:, None]).to(torch.complex128)
 
 
 def _face_coefficients(

@@ -15,13 +15,7 @@ from invertwin.channel import Sampling
 from invertwin.checks import Point
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.confidence.ambiguities import (
-    REJECTION_ZSCORE,
-    are_same_poses,
-    candidate_rotations,
-    describe_difference,
-    difference_score,
-)
+from invertwin.inversion.confidence import ambiguities as equivalents
 from invertwin.inversion.fit import Callback
 from invertwin.inversion.loss import Objective, resolve_loss
 from invertwin.inversion.metrics import pose_error
@@ -122,7 +116,7 @@ class Search:
         best = self.best.scene
         ends = []
         for end, score in zip(self.minima[1:], self.scores[1:], strict=True):
-            pose = describe_difference(best, end.scene, self.objects)
+            pose = equivalents.describe_difference(best, end.scene, self.objects)
             ends.append({"pose": pose, "loss": end.loss, "score": score})
         found = {"other_ends": ends, "ambiguities": list(self.ambiguities)}
         return found | {"screened": list(self.losses)}
@@ -238,13 +232,15 @@ def _compare_ends(
 ) -> Search:
     """Keep the ends that differ, the best first, and test which of them the data reject."""
     ordered = sorted(found, key=_unblurred_loss)
-    ends = list(_drop_repeats(ordered, lambda a, b: are_same_poses(a.scene, b.scene, names)))
-    scores = [None, *(difference_score(ends[0].result, end.result) for end in ends[1:])]
+    ends = list(
+        _drop_repeats(ordered, lambda a, b: equivalents.are_same_poses(a.scene, b.scene, names))
+    )
+    scores = [None, *(equivalents.difference_score(ends[0].result, end.result) for end in ends[1:])]
     texts = tuple(
-        f"{describe_difference(ends[0].scene, end.scene, names)} explains the data nearly as "
-        f"well: z = {z:.1f}"
+        f"{equivalents.describe_difference(ends[0].scene, end.scene, names)} explains the data "
+        f"nearly as well: z = {z:.1f}"
         for end, z in zip(ends, scores, strict=True)
-        if z is not None and z < REJECTION_ZSCORE
+        if z is not None and z < equivalents.REJECTION_ZSCORE
     )
     number = offset + list(found).index(ends[0])
     return Search(ends[0], ends, scores, texts, number, tuple(names), tuple(losses))
@@ -288,7 +284,7 @@ def _rotated_starts(found: Reconstruction) -> Iterator[Scene]:
     """Yield the twin with an object rotated by a near symmetry."""
     none = torch.zeros(3, dtype=torch.float64)
     for module in found.parameters:
-        for turn in candidate_rotations(module, found.scene):
+        for turn in equivalents.candidate_rotations(module, found.scene):
             moved = displace(found.scene[str(module.object)], none, turn)
             yield found.scene.replace(str(module.object), pose=moved.transform.detach())
 
