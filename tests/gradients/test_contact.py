@@ -11,6 +11,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiments" / "gradients" / "co
 NAMES = (
     *("overlapping_balls", "crossed_plates", "sunk_box_rises", "sunk_box_slides"),
     *("box_on_floor", "box_on_floor_grows"),
+    *("box_on_floor_scales", "box_on_floor_scales_and_turns"),
 )
 
 

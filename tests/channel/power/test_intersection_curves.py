@@ -103,6 +103,64 @@ def test_what_moves_where_surfaces_meet_is_in_the_derivative(scene, antennas):
     assert relative(slope(scene, antennas, sampling), truth) < 0.04
 
 
+def standing(theta: Tensor, way: tuple[float, float, float], side: float) -> Scene:
+    """A wedge that stands with one edge on a plate, on one side of it."""
+    points = float64([[x, y, z] for y in (-0.2, 0.2) for x, z in ((0, 0), (-0.1, 0.3), (0.2, 0.3))])
+    sides = [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5], [0, 2, 1], [3, 4, 5]]
+    wedge = Mesh(points * float64([1, 1, side]), torch.tensor(sides))
+    return Scene(
+        {
+            "wedge": moved(thing(wedge, (1.6, 0, -0.8), (0, 0, 0.5), DARK), theta * float64(way)),
+            "floor": thing(plate(4.0, 4.0), (1.6, 0, -0.8), (0, math.pi / 2, 0)),
+        }
+    )
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (0.4, 1.0, 0.6)])
+def test_motion_that_opens_or_closes_a_contact_has_the_mean_of_both_slopes(way):
+    def scene(theta: Tensor) -> Scene:
+        return standing(theta, way, 1.0)
+
+    sampling = replace(SAMPLING, samples=200_000, boundary_samples=100_000)
+    assert relative(slope(scene, link(), sampling), difference(scene, link(), sampling)) < 0.02
+
+
+def test_what_slides_on_the_far_side_of_a_surface_changes_nothing():
+    """Its edge is in the plane of the near side, too."""
+    near = slope(lambda theta: standing(theta, (0.4, 1.0, 0.0), 1.0), link(), SAMPLING)
+    far = slope(lambda theta: standing(theta, (0.4, 1.0, 0.0), -1.0), link(), SAMPLING)
+    assert float(far.abs().sum()) < 1e-6 * float(near.abs().sum())
+
+
+@pytest.mark.parametrize("size", [2.0**-10, 2.0**10])
+@pytest.mark.parametrize("depth", [1, 2])
+def test_maps_and_derivatives_are_those_of_a_scene_of_another_size(depth, size):
+    """From millimetres to kilometres; a power of two leaves no rounding."""
+
+    def found(size: float) -> tuple[Tensor, Tensor]:
+        def scene(theta: Tensor) -> Scene:
+            old = (crossed_plates if depth == 1 else away)(theta).objects
+            return Scene(
+                {
+                    k: Object(Mesh(o.vertices * size, o.mesh.faces), o.material)
+                    for k, o in old.items()
+                }
+            )
+
+        sampling = Sampling(depth, 20_000, 20_000)
+        grid, antennas = Grid(1.0 * size, 0.08 * size, 22), link(rx=((0, 0.15 * size, 0.1 * size),))
+        here = scene(float64(0.0)), antennas, grid
+        return deposit_power(*here, sampling=sampling, seed=1), slope(
+            scene, antennas, sampling, grid
+        )
+
+    def away(theta: Tensor) -> Scene:
+        return box_on_floor(theta, -0.3)
+
+    for value, expected in zip(found(size), found(1.0), strict=True):
+        assert relative(value.double() * size**2, expected) < 1e-4
+
+
 @pytest.mark.parametrize("scene", [crossed_plates, folded, box_on_floor])
 def test_without_contacts_it_is_not(scene):
     truth = difference(scene, link(), SAMPLING)

@@ -7,10 +7,17 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from invertwin.channel.rays import rigid_groups
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.channel.rays.topology import edge_tables, topology_of
-from invertwin.scene import Mesh, box, merge_meshes, plate, rotation_from_vector, sphere
+from invertwin.scene import (
+    Mesh,
+    box,
+    merge_meshes,
+    mesh_topology,
+    plate,
+    rotation_from_vector,
+    sphere,
+)
 from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.mesh_topology import (
     WELD_TOLERANCE,
@@ -204,7 +211,7 @@ def test_contacts_of_copies_of_a_mesh_are_found_once(monkeypatch):
         searches.append(arguments)
         return find_vertices_on_edges(*arguments)
 
-    monkeypatch.setattr(rigid_groups, "find_vertices_on_edges", find)
+    monkeypatch.setattr(mesh_topology, "find_vertices_on_edges", find)
     points = [brick.vertices + k * float64(0.2, 0, 0) for k in range(4)]
     faces = [brick.faces] * 4
     turn = rotation_from_vector(float64(0.3, 0.2, 0.1))

@@ -16,14 +16,8 @@ from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em import plane_waves
 from invertwin.channel.em.dielectric_solids import AIR, DielectricSolids, refract_waves
-from invertwin.channel.em.plane_waves import (
-    area_vector,
-    cross,
-    dot,
-    polygon_integral,
-    reflect_vectors,
-)
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
 
@@ -61,7 +55,7 @@ def build_facets(vertices: Float64[Tensor, "v 3"], topology: Topology) -> Facets
     """
     corners = vertices[topology.faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    volume = dot(corners.detach()[:, 0], area.detach()) / 6
+    volume = plane_waves.dot(corners.detach()[:, 0], area.detach()) / 6
     solid = torch.zeros(len(corners), dtype=torch.bool)
     for number in range(int(topology.face_object.max()) + 1):
         own = topology.face_object == number
@@ -116,12 +110,12 @@ class IlluminatedPatches(Rows):
         """
         difference = scattering_direction - self.wave_vector
         if not difference.is_complex():
-            patches = polygon_integral(self.polygon, difference)
+            patches = plane_waves.polygon_integral(self.polygon, difference)
             return lambda k: patches(k) * torch.exp(-1j * k * self.phase_offset)
         # Relative to a corner: far from the origin, decaying waves would overflow.
         start = self.polygon[:, 0]
-        patches = polygon_integral(self.polygon - start[:, None], difference)
-        phase = dot(difference, start) - self.phase_offset
+        patches = plane_waves.polygon_integral(self.polygon - start[:, None], difference)
+        phase = plane_waves.dot(difference, start) - self.phase_offset
         return lambda k: patches(k) * torch.exp(1j * k * phase)
 
 
@@ -190,7 +184,7 @@ def _trace_order(
         departing = _continue_beams(previous, solids)
     source = torch.arange(len(departing.aspect)).repeat_interleave(count)
     facet = torch.arange(count).repeat(len(departing.aspect))
-    facing = dot(facets.normal[facet], departing.direction[source]).detach()
+    facing = plane_waves.dot(facets.normal[facet], departing.direction[source]).detach()
     is_front = ~(facets.solid[facet] & (facing > 0))
     if solids is not None:
         within = departing.medium[source] == solids.owner[facet]
@@ -204,7 +198,7 @@ def _trace_order(
     if previous is not None:  # clip facets to the beams that leave the previous patches
         polygon = _clip_in_front(corners, beams.normal, beams.polygon[:, 0], 0.0)
         for plane, point, proper in _side_planes(beams.polygon, bounce.direction):
-            polygon = clip(polygon, plane, torch.where(proper, dot(plane, point), -1.0))
+            polygon = clip(polygon, plane, torch.where(proper, plane_waves.dot(plane, point), -1.0))
     bounce = _drop_degenerate(facets, bounce, polygon)
     bounce = _remove_occluded(facets, bounce, None if previous is None else departing, solids)
     bounce = replace(bounce, parent=departing.parent[bounce.parent])
@@ -230,8 +224,8 @@ def _continue_beams(
 
     The normal of a patch points to the side of its beam, and ``parent`` is its row.
     """
-    direction = reflect_vectors(previous.direction, previous.normal)
-    wave = reflect_vectors(previous.wave_vector, previous.normal)
+    direction = plane_waves.reflect_vectors(previous.direction, previous.normal)
+    wave = plane_waves.reflect_vectors(previous.wave_vector, previous.normal)
     row = torch.arange(len(previous.aspect))
     left = replace(previous, transmitted=torch.zeros_like(row, dtype=torch.bool), parent=row)
     if solids is not None:
@@ -246,7 +240,9 @@ def _continue_beams(
         )
         left = concatenate_rows([left, passing.select(rows)])
     # Phase matching on the face.
-    offset = left.phase_offset + dot(left.wave_vector - wave, left.polygon[:, 0].to(wave.dtype))
+    offset = left.phase_offset + plane_waves.dot(
+        left.wave_vector - wave, left.polygon[:, 0].to(wave.dtype)
+    )
     return replace(left, direction=direction, phase_offset=offset, wave_vector=wave)
 
 
@@ -258,7 +254,7 @@ def exceeds_min_amplitude(patches: IlluminatedPatches, wave_number: float) -> Bo
         wave_number: wave number k [1/m].
     """
     polygon = patches.polygon.to(patches.wave_vector.dtype)
-    decay = dot(patches.wave_vector[:, None], polygon).detach().imag
+    decay = plane_waves.dot(patches.wave_vector[:, None], polygon).detach().imag
     decay = decay + patches.phase_offset.detach().imag[:, None]
     return wave_number * decay.amax(1) > math.log(_MIN_AMPLITUDE)
 
@@ -301,10 +297,10 @@ def _subtract_shadows(
     sides = _side_planes(shadow, patches.direction)
     covered = patches.polygon
     for plane, point, proper in sides:
-        covered = clip(covered, plane, torch.where(proper, dot(plane, point), -1.0))
-    hidden = area_vector(covered).detach().norm(dim=1) > _MIN_AREA * facets.size**2
+        covered = clip(covered, plane, torch.where(proper, plane_waves.dot(plane, point), -1.0))
+    hidden = plane_waves.area_vector(covered).detach().norm(dim=1) > _MIN_AREA * facets.size**2
     # The prism of a degenerate or edge-on polygon occludes nothing.
-    profile = dot(area_vector(shadow), patches.direction).detach().abs()
+    profile = plane_waves.dot(plane_waves.area_vector(shadow), patches.direction).detach().abs()
     hidden &= profile > _MIN_AREA * facets.size**2
     if not bool(hidden.any()):
         return patches
@@ -312,9 +308,9 @@ def _subtract_shadows(
     pieces, rest = [patches.select(~hidden)], part.polygon
     for plane, point, proper in sides:
         plane, point, proper = plane[hidden], point[hidden], proper[hidden]
-        outside = clip(rest, -plane, torch.where(proper, -dot(plane, point), 1.0))
+        outside = clip(rest, -plane, torch.where(proper, -plane_waves.dot(plane, point), 1.0))
         pieces.append(_drop_degenerate(facets, part, outside))
-        rest = clip(rest, plane, torch.where(proper, dot(plane, point), -1.0))
+        rest = clip(rest, plane, torch.where(proper, plane_waves.dot(plane, point), -1.0))
     return concatenate_patches(pieces)
 
 
@@ -326,11 +322,11 @@ def _side_planes(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tenso
     centre, found = polygon.mean(1), []
     size = (polygon - centre[:, None]).detach().norm(dim=2).amax(1)
     for start, end in zip(polygon.unbind(1), polygon.roll(-1, 1).unbind(1), strict=True):
-        plane = cross(end - start, direction)
+        plane = plane_waves.cross(end - start, direction)
         length = plane.norm(dim=1)
         proper = length.detach() > 1e-9 * size
         plane = plane / torch.where(proper, length, torch.ones_like(length))[:, None]
-        plane = plane * dot(centre - start, plane).detach().sign()[:, None]
+        plane = plane * plane_waves.dot(centre - start, plane).detach().sign()[:, None]
         found.append((plane * proper[:, None], start, proper))
     return found
 
@@ -338,7 +334,7 @@ def _side_planes(polygon: Tensor, direction: Tensor) -> list[tuple[Tensor, Tenso
 def _clip_in_front(
     polygon: Tensor, normal: Tensor, point: Tensor, margin: Tensor | float
 ) -> Tensor:
-    return clip(polygon, normal, dot(normal, point) + margin)
+    return clip(polygon, normal, plane_waves.dot(normal, point) + margin)
 
 
 def clip(
@@ -356,7 +352,7 @@ def clip(
         normal: normals n of the planes.
         offset: offsets of the planes [m].
     """
-    height = dot(polygon, normal[:, None]) - offset[:, None]
+    height = plane_waves.dot(polygon, normal[:, None]) - offset[:, None]
     after = height.roll(-1, 1)
     inside = height.detach() >= 0
     crossed = inside != inside.roll(-1, 1)
@@ -382,7 +378,7 @@ def _drop_degenerate(
     facets: Facets, patches: IlluminatedPatches, polygon: Tensor
 ) -> IlluminatedPatches:
     """Set the polygons of patches and drop those without area."""
-    keep = area_vector(polygon).detach().norm(dim=1) > _MIN_AREA * facets.size**2
+    keep = plane_waves.area_vector(polygon).detach().norm(dim=1) > _MIN_AREA * facets.size**2
     return replace(patches, polygon=polygon).select(keep)
 
 

@@ -25,16 +25,10 @@ from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.random_walk import PathRecords
 from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler
 from invertwin.channel.power.trace import PowerTracer
+from invertwin.channel.rays import scene_tables
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
 from invertwin.channel.rays.ray_scene import RayScene, is_visible
-from invertwin.channel.rays.scene_tables import (
-    Geometry,
-    flatten,
-    interpolate_values,
-    is_visibility_differentiated,
-    require_silhouette_samples,
-)
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
@@ -88,7 +82,7 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
 
     shadow, normal = moving.detach(), normalize(plane.detach(), dim=1)
     b1, b2 = barycentric_coordinates(torch.stack([p0, p1, p2], 1).detach(), shadow)[:, 1:].unbind(1)
-    material = interpolate_values((p0, p1, p2), b1, b2)
+    material = scene_tables.interpolate_values((p0, p1, p2), b1, b2)
 
     ray, edge = (y - c).detach(), (y1 - y0).detach()
     stretch = (shadow - c.detach()).norm(dim=1) / ray.norm(dim=1)
@@ -120,7 +114,9 @@ def trace_shadow_boundary_paths(
     """
     centres = ("tx",) if rays.link.shared_visibility else ("tx", "rx")
     count = samples // len(centres) * len(centres)
-    sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), centres, count, seed)
+    resting = dr.zeros(mi.UInt32, len(rays.topology.edges))
+    inputs = Inputs.from_rays(rays)
+    sampler = SilhouetteSampler(rays, inputs, centres, count, seed, resting=resting)
     if not sampler.size:
         return []
     edge = project_silhouettes(rays, sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress())
@@ -148,18 +144,18 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
     """
     boundary, edges, depth = sampling.boundary, sampling.boundary_samples, sampling.depth
     with tracing(sampling.backend):
-        geometry = flatten(scene, link.wavelength, motion="free")
+        geometry = scene_tables.flatten(scene, link.wavelength, motion="free")
         if depth > 1:
             geometry.require_static(depth)
         simple = depth == 1 and not geometry.has_sheets
-        if boundary and not simple and is_visibility_differentiated(geometry, link):
+        if boundary and not simple and scene_tables.is_visibility_differentiated(geometry, link):
             raise InputError(
                 "expected explicit paths of one bounce without sheets for derivatives in which "
                 f"silhouettes move, got {depth} bounces or sheets; use deposit_power, or "
                 "boundary=False for fixed visibility"
             )
         if boundary and simple:
-            require_silhouette_samples(geometry, link, edges)
+            scene_tables.require_silhouette_samples(geometry, link, edges)
         trace = PowerTracer(geometry, link, sampling, seed)
         if trace.curves is not None and len(trace.curves.first):
             raise InputError(
@@ -176,7 +172,7 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
 
 
 def _boundary_paths(
-    geometry: Geometry, link: Link, shadow: ProjectedSilhouettes, echo: PathTransfer
+    geometry: scene_tables.Geometry, link: Link, shadow: ProjectedSilhouettes, echo: PathTransfer
 ) -> Paths:
     """Boundary paths: no power, but a derivative."""
     amount = echo.power * received_power_fraction(link, echo.depolarisation) * shadow.area_rate

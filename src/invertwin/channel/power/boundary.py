@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import torch
+
 from invertwin.channel.power import integrand, intersection_curves
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
@@ -23,7 +25,7 @@ from invertwin.channel.power.silhouettes import (
     SilhouetteSampler,
     shadow_speed,
 )
-from invertwin.channel.rays.arrays import opaque
+from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
 from invertwin.channel.rays.ray_scene import RayScene
@@ -123,21 +125,22 @@ class BoundarySamples:
         samples = sampling.boundary_samples * rays.scene_count
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
         inner = depth > 1 and sampling.interior_edges
-        touching = sampling.contacts
-        crossing = curves.select(~curves.touching) if curves is not None else None
-        meet = crossing is not None and len(crossing.first) > 0
+        rests = torch.zeros(len(rays.topology.edges) + 1, dtype=torch.int64)
+        if curves is not None:
+            curves = curves.select(~curves.touching | (curves.edge >= 0))
+            rests[curves.edge] = 1  # the last one stands for crossings
+        meet = curves is not None and len(curves.first) > 0
+        resting = to_index(rests) if sampling.contacts else None
         share = samples // (len(centres) + inner + meet)
         count = len(centres) * share
-        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, meets_touching=touching)
+        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, resting=resting)
         found: list[tuple[_Sampler, _PathBuilder]] = [(antennas, _antenna_silhouette_paths)]
         if inner:
-            inside = InteriorSilhouetteSampler(
-                rays, inputs, share, seed + 2, meets_touching=touching
-            )
+            inside = InteriorSilhouetteSampler(rays, inputs, share, seed + 2, resting=resting)
             found.append((inside, _interior_silhouette_paths))
-        if crossing is not None and meet:
+        if curves is not None and meet:
             contacts = intersection_curves.IntersectionCurveSampler(
-                rays, inputs, crossing, share, depth, seed
+                rays, inputs, curves, share, depth, seed
             )
             found.append((contacts, intersection_curves.intersection_curve_paths))
         self._samplers, self._path_builders = zip(*found, strict=True)

@@ -13,15 +13,7 @@ from torch import Tensor
 
 from invertwin.channel.paths import GainPattern
 from invertwin.channel.power.surface import SCATTERING_TABLES, ScatteringLawTables
-from invertwin.channel.rays import surface_point
-from invertwin.channel.rays.arrays import (
-    from_points,
-    gather_points,
-    to_float,
-    to_index,
-    to_points,
-    to_torch,
-)
+from invertwin.channel.rays import arrays, surface_point
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.surface_point import SurfacePoint, Triangle, interpolate_position
@@ -38,7 +30,7 @@ def to_table(name: str, values: Tensor) -> mit.Float:
         name: name of the table, one of ``DIFFERENTIABLE``.
         values: torch table.
     """
-    return to_points(values) if name in POINT_TABLES else to_float(values)
+    return arrays.to_points(values) if name in POINT_TABLES else arrays.to_float(values)
 
 
 def from_table(name: str, values: mit.Float, like: Tensor) -> Tensor:
@@ -49,7 +41,7 @@ def from_table(name: str, values: mit.Float, like: Tensor) -> Tensor:
         values: array in the layout of the table.
         like: torch table of the shape and type that are returned.
     """
-    flat = from_points(values) if name in POINT_TABLES else to_torch(values)
+    flat = arrays.from_points(values) if name in POINT_TABLES else arrays.to_torch(values)
     return flat.reshape(like.shape).to(like)
 
 
@@ -99,10 +91,10 @@ class Inputs:
             vertices=rays.vertices,
             tx=rays.tx,
             rx=rays.rx,
-            rotations=to_float(link.rotations),
+            rotations=arrays.to_float(link.rotations),
             surfaces=ScatteringLawTables.from_geometry(rays.geometry),
             faces=rays.topology.device_corners,
-            face_surface=to_index(rays.geometry.face_surface),
+            face_surface=arrays.to_index(rays.geometry.face_surface),
             triangles=rays.triangles,
             monostatic=monostatic,
             tx_pattern=PatternTable.from_pattern(link.tx_pattern),
@@ -142,7 +134,7 @@ class Inputs:
         """
         if receiver is True or receiver is False:
             table = self.rx if receiver and not self.monostatic else self.tx
-            return gather_points(table, frame, active)
+            return arrays.gather_points(table, frame, active)
         rx, tx = (self.antenna_position(frame, end, active) for end in (True, False))
         return dr.select(receiver, rx, tx)
 
@@ -180,7 +172,7 @@ class PatternTable:
         table = pattern.table()
         rows, columns = int(table.shape[0]), int(table.shape[1])
         constant = float(table.reshape(-1)[0]) if rows * columns == 1 else None
-        return PatternTable(to_float(table), (rows, columns), constant)
+        return PatternTable(arrays.to_float(table), (rows, columns), constant)
 
     def gain(self, direction: mit.Vector3f) -> mit.Float:
         """Interpolate the linear power gain at unit directions in the radar frame."""

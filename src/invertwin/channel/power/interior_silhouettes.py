@@ -26,7 +26,8 @@ class InteriorSilhouetteSampler:
         seed: seed of the points.
         importance_sampling: False draws edges by length alone and directions from the whole
             sphere, for comparison in benchmarks.
-        meets_touching: True if rays past edges meet surfaces in which the edges lie.
+        resting: 1 for each edge that ends in a surface which goes on beyond it; None if rays past
+            edges do not meet surfaces in which the edges lie.
     """
 
     def __init__(
@@ -37,11 +38,11 @@ class InteriorSilhouetteSampler:
         seed: int,
         *,
         importance_sampling: bool = True,
-        meets_touching: bool = True,
+        resting: mit.UInt32 | None = None,
     ) -> None:
         topology = rays.topology
         self.rays, self.inputs = rays, inputs
-        self.importance_sampling, self.meets_touching = importance_sampling, meets_touching
+        self.importance_sampling, self.resting = importance_sampling, resting
         edge = dr.arange(mi.UInt32, len(topology.edges))
         y0, y1 = rays.exact_ends(edge)
         length = mi.Float(dr.norm(y1 - y0))
@@ -140,7 +141,7 @@ class InteriorSilhouetteSampler:
         for sign, seed in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
             hit = silhouettes.trace_past_edge(
                 rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
-                (index, seed), meets_touching=self.meets_touching and sign > 0,
+                (index, seed), resting=self.resting if sign > 0 else None,
             )  # fmt: skip
             valid &= hit.valid & silhouettes.is_not_grazing(rays, hit.point.face, omega, hit.valid)
             valid &= rays.is_in_scene(frame, hit.point.face, hit.valid)
@@ -160,21 +161,10 @@ class InteriorSilhouetteSampler:
         point = interpolate_position(triangle, source.b1, source.b2)
         measure = dr.squared_norm(point - y) / dr.abs(dr.dot(face_normal(triangle), omega))
         probability = behind.probability * ahead.probability
-        samples = silhouettes.SilhouetteSample(
-            index,
-            False,
-            frame,
-            first,
-            second,
-            sides.side,
-            along,
-            ahead.point.face,
-            weight=measure / (pmf * density * self.samples_per_pose * probability),
-            transmission=behind.transmission.then(ahead.transmission),
-            open=sides.open,
-            covered=sides.covered,
-            source=source,
-        )
+        place = index, False, frame, first, second, sides.side, along, ahead.point.face
+        weight = measure / (pmf * density * self.samples_per_pose * probability)
+        passed = behind.transmission.then(ahead.transmission), sides.open, sides.covered
+        samples = silhouettes.SilhouetteSample(*place, weight, *passed, source)
         return silhouettes.SampleBatch(valid, samples)
 
     def _aim_at_differentiated(

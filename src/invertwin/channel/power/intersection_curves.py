@@ -91,6 +91,7 @@ class IntersectionCurveSampler:
         ends = [(end - rays.origin).float() for end in (curves.start, curves.end)]
         self.ends = list(map(arrays.to_points, ends))
         self.faces = [arrays.to_index(face) for face in (curves.first, curves.second)]
+        self.resting = arrays.to_index(curves.edge + 1)  # 0 of crossings
         self.segments = len(curves.first)
         owner = rays.geometry.face_object[curves.first]
         self.first_frame = rays.object_scene(arrays.to_index(owner)) * rays.poses_per_scene
@@ -144,11 +145,37 @@ class IntersectionCurveSampler:
             exists |= hit.valid & rays.is_in_scene(frame, hit.point.face, hit.valid)
             odds, source = hit.probability, hit.point
             transmission = dr.select(count > 0, hit.transmission, transmission)
+        edge = dr.gather(mi.UInt32, self.resting, entry % self.segments)
+        rests, edge = edge > 0, dr.maximum(edge, 1) - 1
+        exists &= ~rests | self._is_facing(edge, points[0].face, (x, offset), normals, incident)
         weight = dr.norm(offset) / (probability * self.size * odds)
+        weight *= dr.select(rests, 0.5, 1.0)  # the other half is that of `trace_past_edge`
         samples = IntersectionPoint(
             index, frame, weight, transmission, points[0], points[1], source
         )
         return SampleBatch(valid & exists, samples)
+
+    def _is_facing(
+        self, edge: mit.UInt32, face: mit.UInt32, line: tuple[mit.Point3f, mit.Vector3f],
+        normals: Sequence[mit.Vector3f], direction: mit.Vector3f,
+    ) -> mit.Bool:  # fmt: skip
+        """Test whether triangles that end in a surface face directions that lead off it."""
+        x, along = line
+        rays, topology = self.rays, self.rays.topology
+        own = mi.Vector3f(sum(rays.corners(face)) / 3 - x)
+
+        def alike(normal: mit.Vector3f, offset: mit.Vector3f) -> mit.Bool:
+            return dr.dot(normal, offset) * dr.dot(normal, direction) > 0
+
+        found = alike(normals[1], own)
+        columns = zip(topology.device_edge_apexes, topology.device_edge_faces, strict=True)
+        for apexes, faces in columns:
+            apex, other = dr.gather(mi.Int32, apexes, edge), dr.gather(mi.UInt32, faces, edge)
+            vertex = arrays.gather_points(rays.vertices, mi.UInt32(dr.maximum(apex, 0)))
+            there = mi.Vector3f(vertex - x)
+            hides = alike(normals[0], there) & ~alike(dr.cross(along, there), own)
+            found &= ~hides | (apex < 0) | (other == face)
+        return found
 
 
 def decode_subpath(index: mit.UInt32, depth: int) -> tuple[mit.UInt32, mit.Bool | bool]:

@@ -150,7 +150,8 @@ class SilhouetteSampler:
         antennas: antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: number of points over all frames and scenes.
         seed: seed of the points.
-        meets_touching: True if rays past edges meet surfaces in which the edges lie.
+        resting: 1 for each edge that ends in a surface which goes on beyond it; None if rays past
+            edges do not meet surfaces in which the edges lie.
     """
 
     def __init__(
@@ -161,11 +162,11 @@ class SilhouetteSampler:
         samples: int,
         seed: int,
         *,
-        meets_touching: bool = True,
+        resting: mit.UInt32 | None = None,
     ) -> None:
         topology = rays.topology
         self.rays, self.inputs, self.antennas = rays, inputs, antennas
-        self.meets_touching = meets_touching
+        self.resting = resting
         entries = len(antennas) * rays.poses_per_scene * len(topology.edges)
         edge, _, receiver, origin = self._decode_entry(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
@@ -214,19 +215,12 @@ class SilhouetteSampler:
         sides = classify_sides(rays, self.inputs, edge, exact)
         aside = EDGE_OFFSET * (dr.norm(y) + dr.norm(y1 - y0))
         beside, away = mi.Point3f(y + sides.outward * aside), mi.Vector3f(exact)
-        reach = beside - away * _START_OFFSET if self.meets_touching else beside
+        reach = beside - away * _START_OFFSET if self.resting is not None else beside
         before = trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.has_contrast
+        ray = beside, away, valid, (index, self.transmission_seed)
         hit = trace_past_edge(
-            rays,
-            self.inputs,
-            (edge, along),
-            beside,
-            away,
-            valid,
-            (index, self.transmission_seed),
-            meets_touching=self.meets_touching,
-            stratified_bits=index,
+            rays, self.inputs, (edge, along), *ray, resting=self.resting, stratified_bits=index
         )
         face = hit.point.face
         valid &= hit.valid & is_not_grazing(rays, face, away, hit.valid)
@@ -236,20 +230,12 @@ class SilhouetteSampler:
         # Last, since it takes longest: packets without a shadow skip it.
         near = MISS_DISTANCE * dr.norm(exact)
         valid &= ~is_hidden_by_fold(rays, edge, y, exact, sides.outward, aside, near, valid)
-        samples = SilhouetteSample(
-            index,
-            receiver,
-            frame,
-            first,
-            second,
-            sides.side,
-            along,
-            face,
-            weight=1 / (pmf * self.size * hit.probability),
-            transmission=before.then(hit.transmission),
-            open=sides.open,
-            covered=sides.covered,
+        place = index, receiver, frame, first, second, sides.side, along, face
+        weight, transmission = (
+            1 / (pmf * self.size * hit.probability),
+            before.then(hit.transmission),
         )
+        samples = SilhouetteSample(*place, weight, transmission, sides.open, sides.covered)
         return SampleBatch(valid, samples)
 
 
@@ -334,7 +320,7 @@ def trace_past_edge(
     active: mit.Bool,
     key: tuple[mit.UInt32, mit.UInt32],
     *,
-    meets_touching: bool,
+    resting: mit.UInt32 | None,
     stratified_bits: mit.UInt32 | None = None,
 ) -> SegmentHit:
     """Trace rays past points on edges.
@@ -353,31 +339,32 @@ def trace_past_edge(
         direction: directions, as long as the distance of the edge.
         active: mask of active lanes.
         key: index and seed of the random numbers, see ``trace_to_surface``.
-        meets_touching: True if rays past edges meet surfaces in which the edges lie.
+        resting: 1 for each edge that ends in a surface which goes on beyond it; None if rays past
+            edges do not meet surfaces in which the edges lie.
         stratified_bits: see ``trace_to_surface``.
     """
     towards, distance = dr.normalize(direction), dr.norm(direction)
     start = mi.Point3f(origin + direction * RAY_EPSILON)  # type: ignore[operator]
-    touches = crossed = mi.Bool(False)
+    touches = crossed = rests = mi.Bool(False)
     touched = mi.UInt32(0)
-    if meets_touching:
+    if resting is not None:
         early = mi.Point3f(origin - direction * _START_OFFSET)  # type: ignore[operator]
         reach = mi.Float(2 * _START_OFFSET * distance)
         found = rays.find_nearest(mi.Ray3f(early, mi.Vector3f(towards), reach, 0.0, []), active)
         touched = dr.select(found.valid, found.point.face, rays.fallback_face)
         touches = found.valid & ~_is_beside(rays, edge_point[0], touched)
-        crossed = _has_crossed(rays, edge_point, touched, direction)
+        rests = dr.gather(mi.UInt32, resting, edge_point[0]) > 0
+        crossed, in_plane = _has_crossed(rays, edge_point, touched, direction, rests)
+        rests &= in_plane
         start = dr.select(touches, early, start)
+    ray = mi.Ray3f(start, mi.Vector3f(towards))
     hit = trace_to_surface(
-        rays,
-        inputs,
-        mi.Ray3f(start, mi.Vector3f(towards)),
-        active,
-        key,
-        coherent=False,
-        stratified_bits=stratified_bits,
+        rays, inputs, ray, active, key, coherent=False, stratified_bits=stratified_bits
     )
-    return replace(hit, valid=hit.valid & ~(touches & crossed & (hit.point.face == touched)))
+    touches &= hit.point.face == touched
+    # Motion that opens a gap and motion that closes it have two slopes: half of each counts.
+    odds = dr.select(touches & rests, 2.0, 1.0) * hit.probability
+    return replace(hit, valid=hit.valid & ~(touches & crossed), probability=odds)
 
 
 def _is_beside(rays: RayScene, edge: mit.UInt32, face: mit.UInt32) -> mit.Bool:
@@ -395,13 +382,23 @@ def _has_crossed(
     edge_point: tuple[mit.UInt32, mit.Float],
     face: mit.UInt32,
     direction: mit.Vector3f,
-) -> mit.Bool:
-    """Compute the mask of points on edges that are behind triangles, in float64."""
+    resting: mit.Bool,
+) -> tuple[mit.Bool, mit.Bool]:
+    """Compute the masks of points on edges behind triangles and in their planes, in float64.
+
+    Of edges that end in surfaces, those are behind whose own triangles are.
+    """
     y0, y1 = rays.exact_ends(edge_point[0])
     p0, p1, p2 = map(rays.exact_vertex, dr.gather(mi.Vector3u, rays.topology.device_faces, face))
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    normal = -dr.mulsign(normal, dr.dot(normal, mi.Vector3d(direction)))
     height = dr.dot(normal, y0 + (y1 - y0) * mi.Float64(edge_point[1]) - p0)
-    return -dr.mulsign(height, dr.dot(normal, mi.Vector3d(direction))) < -PLANE_TOLERANCE
+    crossed = height < -PLANE_TOLERANCE
+    for column in rays.topology.device_edge_apexes:
+        apex = dr.gather(mi.Int32, column, edge_point[0])
+        offset = rays.exact_vertex(mi.UInt32(dr.maximum(apex, 0))) - p0
+        crossed |= resting & (apex >= 0) & (dr.dot(normal, offset) < -PLANE_TOLERANCE)
+    return crossed, dr.abs(height) <= PLANE_TOLERANCE
 
 
 def is_not_grazing(

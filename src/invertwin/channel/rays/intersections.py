@@ -31,6 +31,8 @@ class IntersectionCurves(Rows):
         first, second: triangle indices.
         start, end: ends of the segments in the world [m].
         touching: True if one surface ends in the other, so that the segment is no crossing.
+        edge: edge of the first surface that ends in the second, beyond which that goes on; −1
+            elsewhere.
     """
 
     first: Int64[Tensor, " n"]
@@ -38,6 +40,7 @@ class IntersectionCurves(Rows):
     start: Float64[Tensor, "n 3"]
     end: Float64[Tensor, "n 3"]
     touching: Bool[Tensor, " n"]
+    edge: Int64[Tensor, " n"]
 
 
 def find_possible_intersections(
@@ -185,7 +188,7 @@ def intersect_triangles(
     line = torch.linalg.cross(normals[0], normals[1])
     kept = line.norm(dim=1) > _MIN_PLANE_SINE
     line = _unit(line)
-    sides, spans, touching = [], [], torch.zeros(len(first), dtype=torch.bool)
+    spans, resting = [], []
     for own, other in ((0, 1), (1, 0)):
         plane, normal = triangles[other][:, 0], normals[other]
         height = ((triangles[own] - plane[:, None]) * normal[:, None]).sum(2)
@@ -200,9 +203,8 @@ def intersect_triangles(
         mine = height.gather(1, apex)
         across = (nearby >= 0) & (edge >= 0)[:, None] & (there * mine < 0)
         across = (across & (there.abs() >= PLANE_TOLERANCE)).any(1)
-        touching |= lies & ~across
+        resting.append(torch.where(lies & ~across, edge, -1))
         kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
-        sides.append(height)
         spans.append(_line_interval(triangles[own], height, line))
     (low, high, place), (others_low, others_high, _) = spans
     low, high = torch.maximum(low, others_low), torch.minimum(high, others_high)
@@ -210,7 +212,12 @@ def intersect_triangles(
     at = (place * line).sum(1)
     ends = (place + line * (value - at)[:, None] for value in (low, high))
     start, end = (value[kept] for value in ends)
-    return IntersectionCurves(first[kept], second[kept], start, end, touching[kept])
+    rests, supports = (edge[kept] for edge in resting)
+    touching, swapped = (rests >= 0) | (supports >= 0), (supports >= 0) & (rests < 0)
+    edge = torch.where((rests >= 0) & (supports >= 0), -1, torch.maximum(rests, supports))
+    pair = first[kept], second[kept]
+    first, second = (torch.where(swapped, pair[1 - k], pair[k]) for k in (0, 1))
+    return IntersectionCurves(first, second, start, end, touching, edge)
 
 
 def _line_interval(

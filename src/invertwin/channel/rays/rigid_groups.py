@@ -18,13 +18,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.scene.mesh_topology import (
-    WELD_TOLERANCE,
-    find_vertices_on_edges,
-    label_components,
-    overlapping_boxes,
-    triangle_sides,
-)
+from invertwin.scene import mesh_topology
 
 Contacts = Float64[Tensor, "n 4"]
 _MAX_CACHED_PAIRS = 10_000
@@ -54,8 +48,8 @@ def find_rigid_groups(
     moves = np.array([is_differentiated(points) for points in vertices])
     start, points = np.cumsum([0, *map(len, fixed)])[:-1], torch.cat(fixed).numpy()
     low, high = (f.reduceat(points, start) for f in (np.minimum, np.maximum))
-    reach = WELD_TOLERANCE * np.linalg.norm(high - low, axis=1)[:, None]
-    near = overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
+    reach = mesh_topology.WELD_TOLERANCE * np.linalg.norm(high - low, axis=1)[:, None]
+    near = mesh_topology.overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
     pairs, gaps = [], []
@@ -64,11 +58,14 @@ def find_rigid_groups(
         contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b]))
         if len(contacts) > 1:
             pairs.append((a, b))
-            gaps.append(_ends_of_gap(contacts, torch.cat([vertices[a], vertices[b]])))
+            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()]
+            gaps.append((points[:, 0], torch.lerp(points[:, 1], points[:, 2], contacts[:, 3:])))
     # One comparison for all pairs, as a rule; else one for each.
     if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
         pairs = list(itertools.compress(pairs, [_move_as_one(*gap) for gap in gaps]))
-    return label_components(np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces))
+    return mesh_topology.label_components(
+        np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces)
+    )
 
 
 def _find_contacts(
@@ -89,17 +86,19 @@ def _find_contacts(
     low = torch.maximum(points[0].amin(0), points[1].amin(0))
     high = torch.minimum(points[0].amax(0), points[1].amax(0))
     size = float((both.amax(0) - both.amin(0)).norm())
-    margin = WELD_TOLERANCE * size
+    margin = mesh_topology.WELD_TOLERANCE * size
     places = (both / size).numpy()
     edges = []
     for number, (triangles, offset) in enumerate(zip(faces, (0, len(points[0])), strict=True)):
         corners = points[number][triangles]
         inside = (corners.amin(1) <= high + margin) & (corners.amax(1) >= low - margin)
         used = (strip_derivatives(triangles)[inside.all(1)] + offset).numpy()
-        edges.append(np.unique(np.sort(triangle_sides(used), axis=1), axis=0))
+        edges.append(np.unique(np.sort(mesh_topology.triangle_sides(used), axis=1), axis=0))
     parts = []
     for own, other in ((0, 1), (1, 0)):
-        row, vertex, share = find_vertices_on_edges(edges[own], np.unique(edges[other]), places)
+        row, vertex, share = mesh_topology.find_vertices_on_edges(
+            edges[own], np.unique(edges[other]), places
+        )
         parts.append(np.column_stack([vertex, edges[own][row], share]))
     found = torch.from_numpy(np.concatenate(parts).astype(np.float64))
     _contacts[key] = [*faces], both, found
@@ -115,12 +114,6 @@ def _is_one_motion(before: Tensor, after: Tensor) -> bool:
     one, other = before - before.mean(0), after - after.mean(0)
     u, _, v = torch.linalg.svd(one.T @ other)
     return bool((one @ (u @ v) - other).abs().amax() <= _SAME_PLACE * other.abs().amax())
-
-
-def _ends_of_gap(contacts: Contacts, points: Float64[Tensor, "v 3"]) -> tuple[Tensor, Tensor]:
-    """Compute the points of contact as vertices of one object, and on edges of the other."""
-    vertex, start, end = points[contacts[:, :3].long()].unbind(1)
-    return vertex, torch.lerp(start, end, contacts[:, 3:])
 
 
 def _move_as_one(first: Float64[Tensor, "n 3"], second: Float64[Tensor, "n 3"]) -> bool:

@@ -29,14 +29,7 @@ from invertwin.channel.em.plane_waves import (
     reflect_vectors,
     triangle_normals,
 )
-from invertwin.channel.rays.arrays import (
-    opaque,
-    to_double,
-    to_float,
-    to_index,
-    to_torch,
-    to_vectors,
-)
+from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
@@ -79,8 +72,8 @@ class CandidateSurfaces(Occluders):
     def device_planes(self) -> dict[str, Any]:
         """Planes as flat Dr.Jit arrays."""
         names = ("point", "normal", "axes", "low", "high")
-        tables = {name: to_double(getattr(self.planes, name)) for name in names}
-        return tables | {"of_face": to_index(self.planes.face_plane.clamp_min(0))}
+        tables = {name: arrays.to_double(getattr(self.planes, name)) for name in names}
+        return tables | {"of_face": arrays.to_index(self.planes.face_plane.clamp_min(0))}
 
     @cached_property
     def device_rim_widths(self) -> Any:
@@ -89,7 +82,7 @@ class CandidateSurfaces(Occluders):
         sides = corners.roll(-1, 1) - corners
         area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
         height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
-        return to_float(self.margin / height.clamp_min(1e-300))
+        return arrays.to_float(self.margin / height.clamp_min(1e-300))
 
     def images(
         self, positions: Float64[Tensor, "row 3"], steps: Int64[Tensor, "row step"]
@@ -292,19 +285,21 @@ class _SequenceScreen:
         self.count = len(steps)
         place = sources.repeat_interleave(self.count, 0)
         seen = surfaces.images(place, steps.repeat(len(sources), 1))
-        self.images = to_double(torch.stack(seen, 1))
-        self.steps = to_index(steps) if self.length else None
+        self.images = arrays.to_double(torch.stack(seen, 1))
+        self.steps = arrays.to_index(steps) if self.length else None
 
     def select_candidates(self, targets: Tensor, source_index: Tensor) -> tuple[Tensor, Tensor]:
         """Return targets and sequences of possible paths, each target from its own source."""
         lane = dr.arange(mi.UInt32, self.count * len(targets))
-        count = opaque(self.count)
+        count = arrays.opaque(self.count)
         target, row = lane // count, lane % count
-        end = dr.gather(mi.Vector3d, to_double(targets - self.surfaces.origin), target)
-        source = dr.gather(mi.UInt32, to_index(source_index), target)
+        end = dr.gather(mi.Vector3d, arrays.to_double(targets - self.surfaces.origin), target)
+        source = dr.gather(mi.UInt32, arrays.to_index(source_index), target)
         first = (source * count + row) * (self.length + 1)
         active, corners, planes, normals = self._intersect_planes(row, first, end)
-        valid = to_torch(self._is_unobstructed(first, active, [*corners, end], planes, normals))
+        valid = arrays.to_torch(
+            self._is_unobstructed(first, active, [*corners, end], planes, normals)
+        )
         keep = torch.nonzero(valid)[:, 0]
         return keep // self.count, keep % self.count
 
@@ -316,8 +311,8 @@ class _SequenceScreen:
         ``intersects_planes`` is the same test in torch.
         """
         surfaces, table = self.surfaces, self.surfaces.device_planes
-        tolerance = opaque(_EXACT_TOLERANCE * surfaces.size, "Float64")
-        margin = opaque(surfaces.margin, "Float64")
+        tolerance = arrays.opaque(_EXACT_TOLERANCE * surfaces.size, "Float64")
+        margin = arrays.opaque(surfaces.margin, "Float64")
         active, position = mi.Bool(True), end
         corners, planes, normals = [], [], []
         for step in reversed(range(self.length)):
@@ -352,7 +347,7 @@ class _SequenceScreen:
         Hits near the rim of a triangle are left to the exact test.
         """
         surfaces = self.surfaces
-        margin, scene = opaque(surfaces.margin, "Float64"), surfaces.scene
+        margin, scene = arrays.opaque(surfaces.margin, "Float64"), surfaces.scene
         start = dr.gather(mi.Vector3d, self.images, first)
         for step, end in enumerate(ends):
             direction = end - start
@@ -529,13 +524,13 @@ def _cast_rays(
     end_plane = torch.maximum(segments.plane, segments.target_plane)
     excess = 2 * margin / dot(unit, planes.normal[end_plane.clamp_min(0)]).abs().clamp_min(1e-3)
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
-    origin = to_vectors(mi.Point3f, start + offset[:, None] * before)
-    direction = to_vectors(mi.Vector3f, unit)
-    reach = mi.Float(to_double((length + excess).clamp_min(0.0)))
+    origin = arrays.to_vectors(mi.Point3f, start + offset[:, None] * before)
+    direction = arrays.to_vectors(mi.Vector3f, unit)
+    reach = mi.Float(arrays.to_double((length + excess).clamp_min(0.0)))
     hit = surfaces.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, reach, 0.0, []))
     valid = hit.is_valid()
-    face = to_torch(dr.select(valid, mi.Int32(hit.prim_index), -1)).long()
-    distance = to_torch(dr.select(valid, hit.t, 0.0)).double()
+    face = arrays.to_torch(dr.select(valid, mi.Int32(hit.prim_index), -1)).long()
+    distance = arrays.to_torch(dr.select(valid, hit.t, 0.0)).double()
     expected = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == segments.plane)
     expected &= distance > length - excess
     return torch.where(expected | (face < 0), face, -2)
