@@ -15,7 +15,7 @@ triangles; twenty bounces and edges at five aspects into its mouth. Prints a tab
 - `order_error_db.order <n>`: the error of the n-th bounce alone, over the whole profile.
 - `rays_per_second`: rays of all bounces over the time; `tracing_share`: the share of the time in
   which rays are traced, those for shadows of the first bounce among them.
-- `duct.seconds` of all its aspects, `duct.tubes` of the bounce that has the most.
+- `duct.seconds` of all its aspects, `duct.patches` of the bounce that has the most.
 """
 
 import argparse
@@ -133,7 +133,7 @@ def duct_metrics(count: int, rows: int, depth: int) -> dict[str, float]:
     triangles = len(scene["duct"].mesh.faces)
     return {
         "triangles": triangles,
-        "tubes": max(rays.patches),
+        "patches": max(rays.patches),
         "seconds": perf_counter() - start,
     }
 
@@ -230,7 +230,7 @@ def table(metrics: dict[str, Any]) -> Table:
     page.row("rays_per_second", metrics["rays_per_second"], ".3g", "tubes' and shadows' rays")
     page.row("tracing_share", metrics["tracing_share"], ".2f", "of the time")
     page.row("duct.seconds", metrics["duct"]["seconds"], ".1f", "five aspects, and their edges")
-    page.row("duct.tubes", metrics["duct"]["tubes"], ".0f", "of the bounce that has the most")
+    page.row("duct.patches", metrics["duct"]["patches"], ".0f", "of the bounce that has the most")
     return page.grid
 
 
