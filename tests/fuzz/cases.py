@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fuzz.damage import Files
+from fuzz.damage import SPECIAL, Files
 from fuzz.formats import Format
 from invertwin.errors import InputError
 
@@ -83,6 +83,7 @@ def outcome(form: Format, files: Files) -> tuple[Broken | None, float]:
 
 def _write(path: Path, data: bytes) -> None:
     """Write a file, or what the words of `damage.SPECIAL` stand for in place of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     match data:
         case b"a pipe":
             os.mkfifo(path)
@@ -127,7 +128,8 @@ def _place(error: BaseException) -> str:
 
 
 def _same(path: Path, data: bytes | None) -> bool:
-    return data is None or (path.is_file() and path.read_bytes() == data)
+    special = data is None or data in SPECIAL
+    return special or (path.is_file() and path.read_bytes() == data)
 
 
 def _most_memory() -> int:

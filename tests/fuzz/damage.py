@@ -4,13 +4,16 @@ Hypothesis draws numbers; what they mean is fixed here, so that a case can be ma
 """
 
 import copy
+import functools
 import io
 import json
 import re
+import sys
 import tomllib
 import zipfile
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
+from importlib.metadata import packages_distributions
 from typing import Any
 
 import h5py
@@ -68,7 +71,8 @@ def damaged(samples: list[Files], edits: Edits, levels: tuple[str, ...]) -> File
     Args:
         samples: Valid files by name.
         edits: What is done.
-        levels: Of "bytes", "words", "values" and "special": which kinds of damage are done.
+        levels: Of "bytes", "words", "values", "numbers", "special" and "planted": which kinds of
+            damage are done.
     """
     files = dict(samples[edits[0] % len(samples)])
     # The first file is the one that is read: it gets half of the damage.
@@ -76,7 +80,9 @@ def damaged(samples: list[Files], edits: Edits, levels: tuple[str, ...]) -> File
     name = names[edits[1] % len(names)]
     chosen = [levels[edit.level % len(levels)] for edit in edits[2]]
     for level, edit in zip(chosen, edits[2], strict=True):
-        if files[name] not in SPECIAL:  # nothing is done to what is no file
+        if level == "planted":
+            files = {**files, **_planted(edit), **files}  # the first stays the first
+        elif files[name] not in SPECIAL:  # nothing is done to what is no file
             files[name] = _LEVELS[level](name, files[name], edit)[:_MOST]
     return files | ({} if {"bytes", "special"} & {*chosen} else {SOUND: b""})
 
@@ -122,6 +128,31 @@ def _change(tree: Any, edit: Edit) -> None:
         case _:
             arrays = isinstance(value, np.ndarray | torch.Tensor) and edit.more % 4
             box[key] = _spoiled(value, edit.more) if arrays else HOSTILE[edit.more % len(HOSTILE)]
+
+
+def _numbers(name: str, data: bytes, edit: Edit) -> bytes:
+    """Give one number of a tree another size or sign: slips of units, and what no physics has."""
+    load, dump = _TREES[name[name.rfind(".") :]]
+    try:
+        tree = load(data)
+        places = [
+            (box, key)
+            for box in _boxes(tree)
+            for key in _keys(box)
+            if isinstance(box[key], int | float) and not isinstance(box[key], bool)
+        ]
+        box, key = places[edit.place % len(places)]
+        value = box[key]
+        if edit.kind % 4:
+            power = 10 ** (1 + edit.more % 18)
+            scaled = (value * power, value / power, -value * power, -value)[edit.kind % 16 // 4]
+            box[key] = int(scaled) if isinstance(value, int) else float(scaled)
+        else:
+            box[key] = NUMBERS[edit.more % len(NUMBERS)]
+        return dump(tree)
+    # A word that another edit has damaged.
+    except Exception:
+        return data
 
 
 def _boxes(tree: Any) -> list[Any]:
@@ -188,7 +219,12 @@ def _hdf5_changed(data: bytes, edit: Edit) -> bytes:
         names = [str(name) for name in file if isinstance(file[name], h5py.Dataset)]
         name = names[edit.place % len(names)]
         keys = list(holder.attrs)
-        match edit.kind % 8:
+        match edit.kind % 9:
+            case 8:  # some kB of file that are gigabytes of fill values
+                shape = _dataset(file, name).shape or (1,)
+                del file[name]
+                size = (*shape[:-1], 1 << (20 + edit.more % 16))
+                file.create_dataset(name, size, "f8", fillvalue=1.0, chunks=True)
             case 0 | 1 if keys:
                 holder.attrs[keys[edit.place % len(keys)]] = hostile
             case 2 if keys:
@@ -288,6 +324,10 @@ def _special(name: str, data: bytes, edit: Edit) -> bytes:
     """Put something else than a file in its place, or one that expands or has many of a thing."""
     if edit.kind % 2:
         return SPECIAL[edit.more % len(SPECIAL)]
+    if name.endswith(".mat") and not data.startswith(b"\x89HDF"):
+        new = io.BytesIO()  # 100 MB at most, of a thousandth of that
+        scipy.io.savemat(new, {"adc": np.zeros(1 << edit.more % 24)}, do_compression=True)
+        return new.getvalue()
     if data.startswith(b"PK"):
         try:
             return _expanding(data, edit)
@@ -321,7 +361,40 @@ def _many(name: str, data: bytes, edit: Edit) -> bytes:
     return b"\n".join(lines)
 
 
-_LEVELS = {"special": _special, "bytes": _bytes, "words": _words, "values": _values}
+_LEVELS = {
+    "special": _special,
+    "bytes": _bytes,
+    "words": _words,
+    "values": _values,
+    "numbers": _numbers,
+}
+RAN = ".ran"
+"""Ends the name of the file that a planted module makes beside itself where it is imported."""
+_MODULE = f"open(__file__ + {RAN!r}, 'w').close()\n".encode()
+_SETTINGS = {
+    "matplotlibrc": b"backend: module://planted\ntext.usetex: True\nfigure.dpi: 9000\n",
+    "planted.py": _MODULE,
+    "libLLVM.so": b"\x7fELF",
+    "pyvenv.cfg": b"home = .\n",
+}
+
+
+@functools.cache
+def _module_names() -> list[str]:
+    """Names of modules that Python, the libraries or nobody has."""
+    known = {*sys.stdlib_module_names, *packages_distributions()}
+    known |= {"sitecustomize", "usercustomize"}
+    return sorted(name for name in known if name.isidentifier())
+
+
+def _planted(edit: Edit) -> Files:
+    """Modules with the names of others, and settings, in the working folder or that of the data."""
+    names, folder = _module_names(), "data/" if edit.kind % 3 == 0 else ""
+    stride = 1 + edit.more % 7
+    chosen = [names[(edit.place + stride * k) % len(names)] for k in range(100)]
+    form = "{}{}/__init__.py" if edit.kind % 2 else "{}{}.py"
+    found = {form.format(folder, name): _MODULE for name in chosen}
+    return found | {folder + name: content for name, content in _SETTINGS.items()}
 
 
 def _npz(data: bytes) -> dict[str, Any]:

@@ -1,6 +1,10 @@
 """Every format that invertwin reads: small valid files, and what reads them."""
 
+import importlib.util
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from email.message import Message
@@ -17,9 +21,10 @@ import torch
 from torch import nn
 
 from cli.small import GRADCHECK, RUN, STARTS
-from fuzz.damage import SOUND, Files
+from fuzz.damage import RAN, SOUND, Files
 from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, read, ti
 from invertwin.capture.readers.described_arrays import write_chirps
+from invertwin.cli.commands.check import run_check
 from invertwin.cli.run_file import load_run, to_toml
 from invertwin.cli.schema import build
 from invertwin.datasets import SampleDataset
@@ -111,6 +116,49 @@ def _runs() -> list[Files]:
         {"run.toml": checked.encode()},
         {"run.toml": file.encode(), "part.ply": mesh},
     ]
+
+
+# Numbers without physical limits: what is estimated before a run begins
+
+_SIMULATED = RUN.replace('"reconstruct"', '"simulate"')
+_DATASET = (
+    RUN.replace('"reconstruct"', '"dataset"')
+    + """
+[dataset]
+samples = 2
+shard = 1
+signals = ["map"]
+
+[[vary]]
+key = "data.snr_db"
+kind = "normal"
+mean = 20.0
+deviation = 3.0
+"""
+)
+_RCS = """task = "rcs"
+frame = 2
+[scene.plate]
+shape = "plate"
+width = 0.1
+height = 0.1
+divisions = 2
+material = { kind = "perfect_conductor" }
+[rcs]
+model = "moments"
+frequencies = [3e9]
+theta_deg = [90.0]
+phi_deg = { start = 0.0, stop = 90.0, count = 19 }
+"""
+
+
+def _estimates() -> list[Files]:
+    fit, checked = RUN + STARTS, RUN.replace("reconstruct", "gradcheck", 1) + GRADCHECK
+    return [{"run.toml": text.encode()} for text in (_SIMULATED, fit, checked, _DATASET, _RCS)]
+
+
+def _read_estimate(path: Path) -> None:
+    run_check(load_run(path))
 
 
 # Meshes
@@ -471,7 +519,10 @@ def _read_manifest(path: Path) -> None:
         for name in ("metrics.json", "run.toml", "unfinished/parts/start0.json"):
             (out / name).write_text("{}")
         (out / "link").symlink_to(path.parent)
-        (out / ".invertwin.json").write_bytes(path.read_bytes())
+        if path.is_file() and path.stat().st_size < 1 << 30:
+            (out / ".invertwin.json").write_bytes(path.read_bytes())
+        else:
+            (out / ".invertwin.json").symlink_to(path)
         try:
             with open_run(out, _TEXTS, **how) as run:
                 if not run.complete:
@@ -586,6 +637,48 @@ def _read_request(data: bytes) -> None:
     assert not admitted or set(map(str, headers.get_all("Host"))) <= hosts
 
 
+# Modules that lie in the folder
+
+_CONSOLE = """
+from invertwin.__main__ import main
+sys.argv = ["invertwin", "simulate", "run.toml", "-o", "out"]
+main()
+"""
+_WORKERS = """
+from invertwin.runtime.engines import run_jobs
+names = ("h5py", "invertwin.viewer", "invertwin.cli.app", "matplotlib.pyplot", "scipy.optimize")
+for _ in run_jobs(exec, [f"import {name}" for name in names], workers=2, engine="processes"):
+    pass
+"""
+_READER = """
+from invertwin.capture import Capture
+Capture.load("data/beat.nc")
+"""
+
+
+def _folders() -> list[Files]:
+    """What is run, and the files that it reads."""
+    found = [
+        {"run.py": _CONSOLE.encode(), "run.toml": _SIMULATED.encode()},
+        {"run.py": _WORKERS.encode()},
+        {"run.py": _READER.encode(), "data/beat.nc": _captures()[0]["beat.nc"]},
+    ]
+    if importlib.util.find_spec("ray") is not None:
+        found.append({"run.py": _WORKERS.replace('"processes"', '"ray"').encode()})
+    return found
+
+
+def _run_in_folder(path: Path) -> None:
+    """Run as the console script does: without the working folder on the import path."""
+    known = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    # Not -P, which its children would inherit.
+    call = [sys.executable, "-c", f"import sys\ndel sys.path[0]\n{path.read_text()}"]
+    ended = subprocess.run(call, cwd=path.parent, env=known, capture_output=True, text=True)
+    ran = [str(file.relative_to(path.parent)) for file in path.parent.rglob(f"*{RAN}")]
+    assert not ran, f"imported {ran}"
+    assert ended.returncode == 0, ended.stderr[-300:]
+
+
 FORMATS: dict[str, Format] = {
     "run_file": Format(_runs, _read_run, ("words", "values", "values", "special")),
     "mesh": Format(_meshes, _read_mesh),
@@ -603,7 +696,7 @@ FORMATS: dict[str, Format] = {
     "view": Format(_views, _read_view, ("bytes", "values", "values", "special")),
     "data_set": Format(_data_sets, _read_data_set, ("bytes", "values", "values", "special")),
     "message": Format(_messages, _read_message, ("bytes", "words", "values")),
-    "manifest": Format(
-        _manifests, _read_manifest, ("bytes", "words", "values"), intact=("victim", "notes.txt")
-    ),
+    "manifest": Format(_manifests, _read_manifest, intact=("victim", "notes.txt")),
+    "estimate": Format(_estimates, _read_estimate, ("numbers",), short=20),
+    "planted": Format(_folders, _run_in_folder, ("planted",), short=4),
 }

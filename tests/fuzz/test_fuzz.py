@@ -7,14 +7,19 @@ from fuzz.cases import outcome
 from fuzz.damage import EDITS, Edits, damaged
 from fuzz.formats import FORMATS
 
+# Those that start processes take long.
+NAMES = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "planted" else name for name in FORMATS
+]
 
-@pytest.mark.parametrize("name", FORMATS)
+
+@pytest.mark.parametrize("name", NAMES)
 def test_valid_files_are_read(unchecked, name):
     for files in FORMATS[name].samples():
         assert outcome(FORMATS[name], files)[0] is None
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", NAMES)
 def test_damaged_files_are_one_line(unchecked, name):
     form = FORMATS[name]
     samples = form.samples()
