@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cli.small import RUN, call
 from invertwin.cli.inputs import find_viewed_file, require_recording
 from invertwin.cli.options import LookOptions
 from invertwin.errors import InputError
@@ -104,3 +105,22 @@ def test_a_folder_shows_its_run_before_its_capture(tmp_path):
     assert find_viewed_file(tmp_path) == tmp_path / "capture.nc"
     (tmp_path / "run.toml").write_text("")
     assert find_viewed_file(tmp_path) == tmp_path / "run.toml"
+
+
+@pytest.mark.parametrize(
+    "words", [["view", "{}"], ["look", "{}"], ["view", "s.toml", "--record", "{}"]]
+)
+def test_names_that_cannot_be_are_told(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.toml").write_text(RUN)
+    assert call(monkeypatch, *(word.format("a" * 300) for word in words)) == 2
+    assert "File name too long" in capsys.readouterr().err
+
+
+def test_a_link_in_a_circle_is_not_replaced_by_a_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.toml").write_text(RUN)
+    (tmp_path / "p.html").symlink_to("p.html")
+    assert call(monkeypatch, "view", "s.toml", "--record", "p.html") == 2
+    assert "got p.html, which exists" in capsys.readouterr().err
+    assert (tmp_path / "p.html").is_symlink()

@@ -1,5 +1,7 @@
 """`invertwin reconstruct` of received levels, in small."""
 
+import gzip
+import os
 import re
 import tomllib
 
@@ -11,6 +13,7 @@ from invertwin.cli.fits.received_levels import spread_of_ends
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import build
+from invertwin.cli.schema.radio_tables import points_file
 from invertwin.errors import InputError
 from invertwin.inversion import SpectrumLoss
 from invertwin.links import ReceiverPoints
@@ -229,3 +232,22 @@ def test_bars_of_a_fit_that_the_data_speak_against_are_not_stated_as_if_they_hel
     note = error_bar_table({**bars, "verdict": word}).note
     assert ("hold only as far as the model does" in note) != hold
     assert ("near the minimum that was found" in note) == hold
+
+
+@pytest.mark.filterwarnings("ignore:loadtxt")  # of a file without rows
+@pytest.mark.parametrize("attack", ["pipe", "address", "archive", "words", "no rows"])
+def test_rows_come_from_a_text_file_only(tmp_path, attack):
+    file = tmp_path / "rows.csv"
+    match attack:
+        case "pipe":
+            os.mkfifo(file)
+        case "address":
+            file = "http://127.0.0.1:9/rows.csv"
+        case "archive":  # NumPy would expand it
+            file = tmp_path / "rows.csv.gz"
+            file.write_bytes(gzip.compress(b"x,y,z\n" + b"0,0,0\n" * 10))
+        case _:
+            file.write_text("x,y,z\n" + "a,b,c\n" * (attack == "words"))
+    said = {"pipe": "a pipe or a device", "address": "no file http:"}.get(attack, "apart by commas")
+    with pytest.raises(InputError, match=said):
+        points_file(str(file))

@@ -1,6 +1,7 @@
 """The command line `invertwin`: from run files and recordings to folders of results."""
 
 import json
+import os
 import shlex
 import sys
 import warnings
@@ -23,6 +24,7 @@ from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
 from invertwin.runtime.threads import available_threads
+from invertwin.storage.folders import convert_os_errors
 from invertwin.storage.run_folder import RunFolder
 
 
@@ -198,13 +200,10 @@ def new(
     name, default = ("plugin.txt", "plugin.py") if kind == "plugin" else (f"{kind}.toml",) * 2
     text = (resources.files("invertwin.cli") / "templates" / name).read_text("utf-8")
     path = file or Path(default)
-    try:
-        with path.open("x", encoding="utf-8") as out:
-            out.write(text)
-    except OSError as error:
-        raise InputError(
-            f"expected a new file in a folder, got {path}: {error.strerror}; name another"
-        ) from None
+    if os.path.lexists(path):
+        raise InputError(f"expected a new file, got {path}, which exists; name another")
+    with path.open("x", encoding="utf-8") as out:
+        out.write(text)
     command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
     call = shlex.join([*(["python"] if kind == "plugin" else ["invertwin", command]), str(path)])
     command_options.console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
@@ -244,8 +243,8 @@ def view(
 ) -> None:
     """Show a run, a scene or a capture in the browser, in three dimensions."""
     inputs.find_viewed_file(target)
-    own = record is not None and record.resolve() == target.resolve()
-    if record is not None and (own or (record.exists() and not overwrite)):
+    own = record is not None and os.path.realpath(record) == os.path.realpath(target)
+    if record is not None and (own or (os.path.lexists(record) and not overwrite)):
         raise InputError(
             f"expected a new file for --record, got {record}, which exists; name another"
             + ("" if own else ", or give --overwrite")
@@ -316,7 +315,8 @@ def main() -> None:
     """Entry point: bad input is one line and exit code 2, an interruption 130."""
     warnings.showwarning = _warn_once()
     try:
-        app(standalone_mode=True)
+        with convert_os_errors(""):
+            app(standalone_mode=True)
     except InputError as error:
         print(f"invertwin: {error}", file=sys.stderr)
         sys.exit(2)

@@ -6,6 +6,7 @@ What can hang or crash its reader is read by a child process: `apart.py`.
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import wraps
+from os.path import realpath  # Path.resolve raises for links in a circle
 from pathlib import Path
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -126,7 +127,7 @@ def named_file(path: str | Path, name: str) -> Path:
         InputError: It lies elsewhere.
     """
     file = Path(path).parent / name
-    if not file.resolve().is_relative_to(Path(path).parent.resolve()):
+    if not Path(realpath(file)).is_relative_to(realpath(Path(path).parent)):
         raise InputError(
             f"expected names of files in the folder of {path}, got {name[:100]!r}, which is "
             "elsewhere; copy it there"

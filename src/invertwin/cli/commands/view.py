@@ -22,7 +22,7 @@ from invertwin.cli.schema.motion_tables import build_moving_scene
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.scene import Scene
-from invertwin.storage.folders import convert_os_errors, replace_file
+from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
 _TIMES, _TIME_STEP = 48, 0.05  # steps in time of what moves, and their distance [s]
@@ -52,7 +52,7 @@ def run_view(
         viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
     if record is not None:
-        with convert_os_errors(""), replace_file(record) as part:
+        with replace_file(record) as part:
             part.write_text(viewer.page_html(display, links), encoding="utf-8")
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return

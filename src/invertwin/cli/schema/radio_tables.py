@@ -1,6 +1,7 @@
 """Radio maps of run files: receiver positions, and measured levels."""
 
 from collections.abc import Sequence
+from io import StringIO
 from typing import Annotated, Literal
 
 import numpy as np
@@ -9,11 +10,11 @@ from annotated_types import Ge, Len, MinLen
 from torch import Tensor
 
 from invertwin import links
-from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.registry.kinds import KindGroup, Registry
 from invertwin.registry.section import InputPath, Section, Seed, Vector, key, prefix_errors
 from invertwin.scene import load_mesh
+from invertwin.storage.untrusted import convert_read_errors, read_text
 
 
 class ReceivedData(Section):
@@ -128,13 +129,10 @@ def mesh_cells(file: InputPath, points: Count = 16, edge_points: Count = 20_000)
 
 
 def _read_rows(file: str, min_columns: int) -> Tensor:
-    try:
-        rows = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"expected rows of numbers apart by commas, got {error}") from None
-    if rows.shape[1] < min_columns or not len(rows) or not np.isfinite(rows).all():
-        raise InputError(
-            f"expected rows of at least {min_columns} finite numbers below a line of heads, got "
-            f"{rows.shape[0]} rows of {rows.shape[1]}; see docs/run_files.md"
-        )
+    what = "rows of numbers apart by commas below a line of heads"
+    with convert_read_errors(file, what, "see docs/run_files.md"):
+        # As text: NumPy would expand archives, and fetch addresses.
+        rows = np.loadtxt(StringIO(read_text(file, what)), delimiter=",", skiprows=1, ndmin=2)
+        if rows.shape[1] < min_columns or not len(rows) or not np.isfinite(rows).all():
+            raise ValueError(f"{rows.shape}, not rows of at least {min_columns} finite numbers")
     return torch.from_numpy(rows)
