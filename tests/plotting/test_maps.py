@@ -176,3 +176,13 @@ def test_residuals_beyond_the_mark_are_framed():
     (image,) = cell.images
     assert float(shown(cell)[1, 2]) == 8.0
     assert image.get_clim() == (-10.0, 10.0)
+
+
+def test_ranges_without_echoes_are_left_out_and_the_label_says_so():
+    grid = Grid(1.0, 0.5, 40, -0.4, 0.2, 5)
+    spectrum = torch.full((1, *grid.shape), 1e-2, dtype=torch.float64)
+    spectrum[0, 10:13, 2] = 1.0
+    (axes,) = cells(plotting.spectrum({"data": spectrum}, grid))
+    # Four bins before and behind echoes from 6 to 7 m.
+    assert axes.get_ylim() == pytest.approx((3.75, 9.25))
+    assert axes.get_ylabel() == "range [m], of 1 to 20.5"

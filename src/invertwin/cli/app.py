@@ -60,13 +60,8 @@ class _CommandGroup(TyperGroup):
 
 # Panels of the list of commands.
 _RUN, _DATA, _LEARN, _DEVELOP = "Run files", "Recordings", "Begin", "Develop"
-app = typer.Typer(
-    name="invertwin",
-    cls=_CommandGroup,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-)
+_PLAIN: dict[str, Any] = {"pretty_exceptions_enable": False, "add_completion": False}
+app = typer.Typer(name="invertwin", cls=_CommandGroup, no_args_is_help=True, **_PLAIN)
 
 
 def _command_with(

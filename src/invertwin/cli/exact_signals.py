@@ -1,5 +1,7 @@
 """Exact signals with the settings of a run file: data of simulations and of fits of them."""
 
+from typing import Any
+
 import torch
 
 from invertwin.channel import Grid, Sampling
@@ -69,11 +71,6 @@ def require_simulated_data(run: RunFile) -> SimulatedData:
 
 
 def _make_sampling(data: SimulatedData, depth: int) -> Sampling:
-    return Sampling(
-        depth=depth,
-        conductor_samples=data.samples,
-        boundary_samples=0,
-        boundary=False,
-        points_per_m2=data.points_per_m2,
-        rough_paths=data.rough_paths,
-    )
+    rough: Any = {"points_per_m2": data.points_per_m2, "rough_paths": data.rough_paths}
+    smooth: Any = {"conductor_samples": data.samples, "boundary_samples": 0, "boundary": False}
+    return Sampling(depth, **smooth, **rough)

@@ -195,13 +195,9 @@ def print_tables(tables: Sequence[ReportTable]) -> None:
         grid = RichTable(title=Text(table.title), title_justify="left")
         for i, column in enumerate(table.columns):
             numbers = [len(format_cell(row[i])) for row in table.rows if is_numeric_cell(row[i])]
-            grid.add_column(
-                Text(column),
-                justify="right" if numbers else "left",
-                no_wrap=i == 0,
-                min_width=max(numbers, default=None),
-                overflow="fold",
-            )
+            least, side = max(numbers, default=None), "right" if numbers else "left"
+            how: Any = {"justify": side, "overflow": "fold", "min_width": least}
+            grid.add_column(Text(column), no_wrap=i == 0, **how)
         for row in table.rows:
             grid.add_row(*(Text(format_cell(cell)) for cell in row))
         least = grid.__rich_measure__(console, console.options).minimum

@@ -16,6 +16,7 @@ from invertwin.plotting.curves import rcs_image as rcs_image
 from invertwin.plotting.curves import rcs_profile as rcs_profile
 from invertwin.plotting.figures import PALETTE as PALETTE
 from invertwin.plotting.figures import png_bytes as png_bytes
+from invertwin.plotting.from_above import from_above as from_above
 from invertwin.plotting.maps import RATE_LABEL as RATE_LABEL
 from invertwin.plotting.maps import U_LABEL as U_LABEL
 from invertwin.plotting.maps import V_LABEL as V_LABEL

@@ -62,10 +62,10 @@ def coverage(
     width, height = np.ptp(grid[..., 0]), np.ptp(grid[..., 1])
     tall = min(max(3.4 * height / width, 1.6), 5.0)
     figure, cells = row_of_axes(count, (1.4 + 3.4 * count, tall + 0.9), sharey=True)
-    lines = [] if scene is None else _project_edges(scene, plane)
+    lines = [] if scene is None else project_edges(scene, plane)
     marks = None if transmitters is None else _project_to_plane(plane, transmitters.positions)
     split = len(levels)
-    top = max((float(v.detach().amax()) for v in levels.values()), default=0.0)
+    top = max((float(v.nan_to_num(-1e3).max()) for v in levels.values()), default=0.0)
     for part, maps, style, name in (
         (cells[:split], levels, {"vmin": top - dynamic_range, "vmax": top}, label),
         (cells[split:], rates, signed_colors(rates.values(), _SHARE), derivative_label),
@@ -103,7 +103,7 @@ def _names(plane: MapPlane) -> list[str]:
     return found
 
 
-def _project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
+def project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
     """Sharp edges of all objects, in the plane."""
     lines: list[NDArray[Any]] = []
     for item in scene.objects.values():

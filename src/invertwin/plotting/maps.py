@@ -25,6 +25,8 @@ from invertwin.radar import DopplerMaps
 U_LABEL, V_LABEL = "direction cosine u (to the left)", "direction cosine v (up)"
 RATE_LABEL = "range rate [m/s], away > 0"
 _MIN_POWER = 1e-30  # power that stands for none in dB
+_NOISE_MARGIN = 4.0  # power of an echo over the median of a map
+_RANGE_MARGIN = 4  # bins that are shown before and behind echoes
 
 Maps = Tensor | Mapping[str, Tensor]
 """Spectra [frame, range, u, v] by title, or a single one."""
@@ -72,8 +74,7 @@ def spectrum(
         for row, view in enumerate(views)
     ]
     _draw_decibels(figure, drawn, relative, dynamic_range)
-    for row in cells:
-        row[0].set_ylabel("range [m]", fontsize=8)
+    _crop_ranges(drawn, dynamic_range)
     return figure
 
 
@@ -88,7 +89,7 @@ def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figu
     figure, cells = row_of_axes(len(maps), (3.9 * len(maps), 3.6))
     drawn = [(cell, *item) for cell, item in zip(cells, maps.items(), strict=True)]
     _draw_decibels(figure, drawn, True, dynamic_range)
-    cells[0].set_ylabel("range [m]", fontsize=8)
+    _crop_ranges(drawn, dynamic_range)
     return figure
 
 
@@ -234,6 +235,23 @@ def _draw_decibels(
     add_colorbar(figure, image, [cell for cell, *_ in panels], label)
 
 
+def _crop_ranges(panels: list[tuple[Any, str, MapPanel]], dynamic_range: float) -> None:
+    """Show the ranges that have echoes in any of the panels, and say of which these are a part."""
+    ranges, kept = panels[0][2].ranges, torch.zeros(len(panels[0][2].ranges), dtype=torch.bool)
+    for *_, panel in panels:
+        power = panel.values.detach().cpu().amax(1)
+        noise = _NOISE_MARGIN * panel.values.detach().cpu().median()
+        kept |= power >= (power.max() * 10 ** (-dynamic_range / 10)).maximum(noise)
+    rows = kept.nonzero()[:, 0].tolist() or [0, len(ranges)]
+    shown = ranges[max(rows[0] - _RANGE_MARGIN, 0) : rows[-1] + 1 + _RANGE_MARGIN]
+    label = f"range [m], of {ranges[0]:.3g} to {ranges[-1]:.3g}"
+    for cell, *_ in panels:
+        cell.set_ylim(bin_edges(shown))
+        if cell.get_subplotspec().is_first_col():
+            whole = len(shown) == len(ranges)
+            cell.set_ylabel("range [m]" if whole else label, fontsize=8)
+
+
 def _draw_signed(cell: Any, title: str, panel: MapPanel, limit: float) -> Any:
     return _draw_image(
         cell, title, panel, numbers(panel.values), vmin=-limit, vmax=limit, cmap="RdBu_r"
@@ -265,7 +283,9 @@ def _add_degrees(cell: Any, name: str) -> None:
             lambda angle: np.sin(np.deg2rad(np.clip(angle, -90, 90))),
         ),
     )
-    scale.tick_params(labelsize=6, pad=1)
+    # Towards the rim degrees are so near to each other that their numbers would overlap.
+    scale.xaxis.set_major_formatter(lambda angle, _: f"{angle:g}" if abs(angle) < 65 else "")
+    scale.tick_params(labelsize=7, pad=1)
     scale.set_xlabel(f"{name} [°]", fontsize=7, labelpad=2)
 
 

@@ -1,7 +1,6 @@
 """Figures of rooms from above: path gain, a panel's places, located transmitters."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -10,6 +9,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin.deprecation import rename_arguments
+from invertwin.links import MapPlane
+from invertwin.plotting.coverage import coverage, project_edges
 from invertwin.plotting.figures import PALETTE, legible, numbers, row_of_axes
 from invertwin.scene import Scene
 
@@ -34,21 +35,17 @@ def floor_plan(
         height: z of the map [m].
         tx, panel: Where they stand [m].
     """
-    figure, cells = row_of_axes(len(levels), (1.0 + 4.6 * len(levels), 3.9), sharey=True)
-    low, high = (numbers(corner) for corner in corners)
-    top = max(float(value.max()) for value in levels.values())
-    image: Any = None
-    place = {"origin": "lower", "extent": (low[0], high[0], low[1], high[1]), "aspect": "equal"}
-    for axes, (title, value) in zip(cells, levels.items(), strict=True):
-        image = axes.imshow(numbers(value).T, vmin=top - _SPAN, vmax=top, cmap="viridis", **place)
-        _draw_walls(axes, scene, height, 1.5)
+    low, high = corners
+    sides = torch.diag(high - low)[:2]
+    middle = torch.cat([low[:2], low.new_tensor([height])])
+    (count,) = {(len(value), value.shape[1]) for value in levels.values()}
+    plane = MapPlane(middle, *sides, count=count)
+    figure = coverage(levels, plane, scene=scene, dynamic_range=_SPAN)
+    for axes, title in zip(figure.axes, levels, strict=False):
         axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
         if title != next(iter(levels)):
             axes.plot(*numbers(panel)[:2], "s", color=PALETTE[1], label="panel")
-        axes.set(title=legible(title), xlabel="x [m]")
         axes.legend(fontsize=8, loc="upper left")
-    cells[0].set_ylabel("y [m]")
-    figure.colorbar(image, ax=cells, label="path gain [dB]")
     return figure
 
 
@@ -93,7 +90,8 @@ def transmitter_fits(
         fits: Start and end of each [m].
     """
     figure, (axes,) = row_of_axes(1, (6.4, 4.6))
-    _draw_walls(axes, scene, height, 1.2)
+    plane = MapPlane.horizontal([0.0, 0.0], [1.0, 1.0], height, 1.0)
+    axes.add_collection(LineCollection(project_edges(scene, plane), colors="black", linewidths=1))
     ways = numbers(fits)[..., :2]
     axes.add_collection(LineCollection([*ways], colors="0.75", linewidths=0.8))
     axes.plot(*ways[:, 0].T, "o", color="0.6", markersize=4, label="starts")
@@ -103,19 +101,3 @@ def transmitter_fits(
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
-
-
-def _draw_walls(axes: Any, scene: Scene, height: float, width: float) -> None:
-    """Draw the segments in which a level plane cuts the triangles of a scene."""
-    found: list[list[list[float]]] = []
-    for item in scene.objects.values():
-        corners = item.vertices.detach()[item.mesh.faces]
-        for triangle, rise in zip(corners, corners[..., 2] - height, strict=True):
-            points = []
-            for a, b in ((0, 1), (1, 2), (2, 0)):
-                if (rise[a] > 0) != (rise[b] > 0):
-                    share = rise[a] / (rise[a] - rise[b])
-                    points.append(torch.lerp(triangle[a], triangle[b], share)[:2].tolist())
-            if len(points) == 2:
-                found.append(points)
-    axes.add_collection(LineCollection(found, colors="black", linewidths=width))

@@ -177,13 +177,11 @@ class Display:
         Args:
             step: One of the steps.
         """
-        bodies = {f"twin/{name}": body for name, body in step.bodies.items()}
-        layers = [
-            replace(x, points=bodies[x.name].vertices, faces=bodies[x.name].faces)
-            if x.name in bodies
-            else x
-            for x in self.layers
-        ]
+        bodies: dict[str, Any] = {
+            f"twin/{name}": {"points": body.vertices, "faces": body.faces}
+            for name, body in step.bodies.items()
+        }
+        layers = [replace(layer, **bodies.get(layer.name, {})) for layer in self.layers]
         return replace(self, layers=layers)
 
     def save(self, path: str | Path) -> None:

@@ -119,11 +119,8 @@ def reconstruction_html(found: Reconstruction) -> str:
     Args:
         found: The fit.
     """
-    rows: list[tuple[Any, ...]] = [
-        ("why it stopped", found.status),
-        ("steps", found.steps),
-        ("loss", f"{found.loss:.4g}"),
-    ]
+    rows: list[tuple[Any, ...]] = [("why it stopped", found.status), ("steps", found.steps)]
+    rows.append(("loss", f"{found.loss:.4g}"))
     known = vars(found)
     bars = known["uncertainty"].interval() if "uncertainty" in known else {}
     if "verdict" in known:

@@ -68,15 +68,9 @@ def collect_sensor_maps(
     """
     names = list(dict.fromkeys([*display.maps, *sensors]))
     count = _MAX_MAPS // (max(1, len(display.steps)) * max(1, len(names)))
-    found = {
-        name: _collect_maps(display, name, sensors.get(name), min(max(1, count), _MAX_FRAMES))
-        for name in names
-    }
-    return {
-        name: own
-        for name, own in found.items()
-        if own.measured is not None or own.simulated is not None
-    }
+    count = min(max(1, count), _MAX_FRAMES)
+    found = {name: _collect_maps(display, name, sensors.get(name), count) for name in names}
+    return {k: x for k, x in found.items() if x.measured is not None or x.simulated is not None}
 
 
 def _collect_maps(
@@ -203,15 +197,8 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             {"name": name, "color": color, "size": size, "shown": name != SAMPLED_PATHS}
             for name, (color, size) in POSITION_LAYERS.items()
         ],
-        "pictures": {
-            "measured": panels.MEASURED,
-            "simulated": panels.SIMULATED,
-            "residual": panels.RESIDUAL,
-        },
-        "colors": {
-            "power": _colormap(panels.POWER_COLORMAP),
-            "apart": _colormap(panels.RESIDUAL_COLORMAP),
-        },
+        "pictures": {name: name for name in (panels.MEASURED, panels.SIMULATED, panels.RESIDUAL)},
+        "colors": dict(zip(("power", "apart"), map(_colormap, panels.COLORMAPS), strict=True)),
         "depth": -panels.MIN_LEVEL_DB,
         "largest": panels.MAX_RESIDUAL_DB,
     }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 MEASURED, SIMULATED, RESIDUAL = "measured", "simulated", "residual"
-POWER_COLORMAP, RESIDUAL_COLORMAP = "viridis", "RdBu_r"  # colour maps
+POWER_COLORMAP, RESIDUAL_COLORMAP = COLORMAPS = "viridis", "RdBu_r"  # of power, of residuals
 MIN_LEVEL_DB = -40.0  # dB below the peak
 MAX_RESIDUAL_DB = 15.0  # dB of a residual
 _DEGREE_STEPS = (5, 10, 15, 30)  # between ticks of the azimuth [°]

@@ -279,11 +279,9 @@ class Viewer:
             how |= {"color": layer.color, "opacity": None if layer.opacity == 1 else layer.opacity}
             how |= {"cast_shadow": False, "receive_shadow": False}
             faces = self._walls.get(layer.name, layer.faces)
-            look = {
-                "flat_shading": True,
-                "side": "front" if layer.name in self._walls else "double",
-            }
-            made = scene.add_mesh_simple(node, layer.points, faces, **look, **how)
+            how |= {"flat_shading": True}
+            side = "front" if layer.name in self._walls else "double"
+            made = scene.add_mesh_simple(node, layer.points, faces, side=side, **how)
             if layer.group == "twin":
                 name, top = layer.name.split("/", 1)[1], self._top(layer)
                 self._labels[layer.name] = scene.add_label(f"{node}/name", name, position=top)
@@ -381,12 +379,8 @@ class Viewer:
         place = np.broadcast_to(to_float32(sample.position), some[:, 0].shape)
         corners = np.stack([place, some[:, 0], some[:, 0], some[:, 1]], axis=1)
         fed = to_float32(sample.points_in_bin(*chosen)) if chosen else np.zeros((0, 3), np.float32)
-        found = {
-            SAMPLED_PATHS: corners.reshape(-1, 3),
-            layers.VISIBLE_POINTS: points[:, 1],
-            layers.BOUNDARY_POINTS: sample.edges,
-            layers.BIN_POINTS: fed,
-        }
+        found = {SAMPLED_PATHS: corners.reshape(-1, 3), layers.VISIBLE_POINTS: points[:, 1]}
+        found |= {layers.BOUNDARY_POINTS: sample.edges, layers.BIN_POINTS: fed}
         with self._server.atomic():
             for name, places in found.items():
                 color, size = POSITION_LAYERS[name]

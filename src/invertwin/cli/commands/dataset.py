@@ -201,11 +201,8 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
     joints = joint_positions_at_start(own, begun)
-    told = {
-        "index": index,
-        "objects": labels.object_labels(begun, seen, table.classes, joints),
-        "radar": labels.radar_labels(sensor.radar),
-    }
+    objects = labels.object_labels(begun, seen, table.classes, joints)
+    told = {"index": index, "objects": objects, "radar": labels.radar_labels(sensor.radar)}
     files = {f"{name}.npy": shards.npy_bytes(array) for name, array in arrays.items()}
     text = json.dumps(told, ensure_ascii=False, allow_nan=False)
     return files | {"labels.json": text.encode(), "run.toml": to_toml(own).encode()}

@@ -257,17 +257,9 @@ def _run_check(
             )
     check = settings.build()
     radar = seen.device[0] if seen.device else None
-    report = gradcheck(
-        seen.model,
-        module,
-        tangent,
-        scene=scene,
-        sensor=seen.sensor,
-        acts_on=settings.acts_on,
-        settings=check,
-        seed=run.seed,
-        progress=say,
-    )
+    how: Any = {"settings": check, "seed": run.seed, "progress": say}
+    ends: Any = {"scene": scene, "sensor": seen.sensor, "acts_on": settings.acts_on}
+    report = gradcheck(seen.model, module, tangent, **ends, **how)
     save_picture(folder, f"{name}", seen.draw(report))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
     save_picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))
@@ -311,11 +303,9 @@ def _find_studies(run: RunFile) -> dict[str, GradcheckStudy]:
 
 def _derivative_maps(report: GradientReport, at: Any = ...) -> dict[str, Tensor]:
     """Derivatives at an index of the maps, by the terms that they have."""
-    return {
-        "differences": report.difference[at],
-        "full": report.gradient[at],
-        "interior only": report.interior_gradient[at],
-    }
+    found = {"differences": report.difference, "full": report.gradient}
+    found["interior only"] = report.interior_gradient
+    return {name: values[at] for name, values in found.items()}
 
 
 def _derivative_unit(settings: GradcheckTable) -> str:

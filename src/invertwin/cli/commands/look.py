@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from invertwin import capture as captures
+from invertwin import plotting
 from invertwin import radar as radars
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
@@ -18,7 +19,7 @@ from invertwin.cli.inputs import find_plugin_recording
 from invertwin.cli.options import LookOptions, RecordingOptions
 from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.plotting import MapPanel, direction_panels, doppler_panels, panels
+from invertwin.plotting import MapPanel
 from invertwin.radar.boards import Mounting
 from invertwin.registry.kinds import registry
 from invertwin.storage.run_folder import RunFolder
@@ -62,7 +63,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.max_range}
     if radar.range_origin is not None:
         metrics["range_origin_m"] = float(radar.range_origin.mean())
-    shown, found = _make_panels(capture, chirps, grid, options.frame)
+    shown, found, power = _make_panels(capture, chirps, grid, options.frame)
     if capture.dataset.get("beat", capture.dataset).attrs.get("units") == "count":
         found["peak_counts_db"] = found.pop("peak_power_db")
     metrics |= found
@@ -87,10 +88,16 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
             radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
-    drawn = save_picture(folder, "look", panels(shown), f"Frame {options.frame}", "doppler")
-    status = f"{answer}; {radar.frame_count} frames, read as {reader}."
+    drawn = save_picture(
+        folder, "look", plotting.panels(shown), f"Frame {options.frame}", "doppler"
+    )
+    status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
     again = options.command("look", folder.path)
     parts = [*tables, drawn]
+    if grid.u_count > 1 and points is not None and len(points):
+        maps, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
+        above = plotting.from_above(maps, grid, one, {"detections": points.position})
+        parts.append(save_picture(folder, "above", above, "From above", "above"))
     return write_report(folder, metrics, title, status, parts, again=again, note=note), answer
 
 
@@ -232,27 +239,28 @@ def _high_resolution_panels(
     else:
         profile = radars.doppler_snapshots(chirps.beat, radar, grid, chirps.chirps, options.frame)
     power = radars.high_resolution_map(profile, radar, grid, options.method, options.sources)
-    return direction_panels(f"everything, {options.method}", power, grid)
+    return plotting.direction_panels(f"everything, {options.method}", power, grid)
 
 
 def _make_panels(
     capture: captures.Capture, chirps: captures.ChirpCapture | None, grid: Grid, frame: int
-) -> tuple[dict[str, MapPanel], dict[str, Any]]:
-    """Make the pictures and numbers of one frame."""
+) -> tuple[dict[str, MapPanel], dict[str, Any], torch.Tensor]:
+    """Make the pictures and numbers of one frame; return also its power [range, u, v]."""
     if chirps is not None:
         maps = radars.doppler_maps(chirps.beat, chirps.device, grid, chirps.chirps, frame)
-        return doppler_panels(maps), {
+        numbers = {
             "chirps": chirps.chirps.count,
             "velocity_span_m_s": radars.velocity_span(chirps.device, chirps.chirps),
             **maps.strongest_peak.metrics("peak"),
             "moves": maps.moving_peak is not None,
             **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
         }
+        return plotting.doppler_panels(maps), numbers, maps.total_power
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()
-    shown = direction_panels("range and direction", spectrum, grid)
+    shown = plotting.direction_panels("range and direction", spectrum, grid)
     numbers = radars.find_peak(spectrum, grid).metrics("peak")
     del numbers["peak_velocity_m_s"]
     if not shown:
         del numbers["peak_azimuth_deg"]
         shown["range"] = MapPanel(spectrum[:, :, 0], grid.ranges, torch.zeros(1), "one channel")
-    return shown, numbers
+    return shown, numbers, spectrum

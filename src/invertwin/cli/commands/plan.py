@@ -51,11 +51,8 @@ def run_plan(run: RunFile, folder: RunFolder, console: Console) -> list[ReportTa
     metrics: dict[str, Any] = {"task": "plan", **error_bar_metrics(found), "verdict_reasons": []}
     first = len(own.first_sensor.sensor.positions) - len(places)
     metrics["candidates"] = [
-        {
-            "position": places[one.frame - first].tolist(),
-            "share": one.deviation_ratio,
-            "standard_deviations": one.error_bars.deviations,
-        }
+        {"position": places[one.frame - first].tolist(), "share": one.deviation_ratio}
+        | {"standard_deviations": one.error_bars.deviations}
         for one in added
     ]
     metrics |= _compare_with_fits(replace(own, run=run), found.deviations, folder, console)
@@ -101,9 +98,6 @@ def _compare_with_fits(
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
     ratios = {n: own / spread[n] for n, own in predicted_deviations.items() if spread.get(n)}
-    return {
-        "simulated_fits": count,
-        "observed_deviations": spread,
-        "observed_means": dict(zip(rows[0], errors.mean(0).tolist(), strict=True)),
-        "predicted_over_observed": ratios,
-    }
+    means = dict(zip(rows[0], errors.mean(0).tolist(), strict=True))
+    observed = {"observed_deviations": spread, "observed_means": means}
+    return {"simulated_fits": count, **observed, "predicted_over_observed": ratios}

@@ -33,8 +33,8 @@ from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
-# Signals, metrics, picture, its note.
-_SimulationOutcome = tuple[torch.Tensor, dict[str, Any], Figure, str]
+# Signals, metrics, picture, its note, power [frame, range, u, v] by title.
+_SimulationOutcome = tuple[torch.Tensor, dict[str, Any], Figure, str, dict[str, torch.Tensor]]
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -46,27 +46,26 @@ def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
         make_chirp_settings(run, radar)  # its errors come before any work
     require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
     simulated = _simulate_frames if run.chirps is None else _simulate_moving_frames
-    beat, found, figure, note = simulated(run, folder, scene, radar, grid)
-    metrics = {
-        "task": "simulate",
-        "frames": radar.frame_count,
-        "channels": len(radar.virtual_positions),
-        "bins": list(grid.shape),
-        **found,
-        "answer": (answer := describe_peak(found)),
-    }
+    beat, found, figure, note, maps = simulated(run, folder, scene, radar, grid)
+    counts = {"frames": radar.frame_count, "channels": len(radar.virtual_positions)}
+    answer, counts = describe_peak(found), counts | {"bins": list(grid.shape)}
+    metrics = {"task": "simulate", **counts, **found, "answer": answer}
     if run.raw is not None:
         metrics |= write_raw_files(run, radar, beat, folder)
     save_mesh(folder.file("twin.ply"), scene)
-    view = plotting.scene(scene, radar, highlight=list(run.truth))
+    view = plotting.scene(scene, radar, highlight=list(run.truth) or None)
     shown = ("spectra", "Spectra") if run.chirps is None else ("doppler", "First frame")
     parts = [
         quantity_table("Simulation", metrics),
         save_picture(folder, "scene", view),
         save_picture(folder, shown[0], figure, shown[1], note),
     ]
+    seen = radar if run.chirps is None else radar.frames([0])
+    if grid.u_count > 1 or seen.frame_count > 1:
+        above = plotting.from_above(maps, grid, seen, {"scene": scene})
+        parts.append(save_picture(folder, "above", above, "From above", "above"))
     count = f"{found['chirps']} chirps a frame" if run.chirps else f"{found['paths']} paths"
-    title, status = run.title or "Simulation", f"{answer}; {count}, {radar.frame_count} frames."
+    title, status = run.title or "Simulation", f"{answer}; {count}, frames: {radar.frame_count}."
     tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
     return tables, answer
 
@@ -95,7 +94,7 @@ def _simulate_frames(
         "wall_seconds": seconds,
     }
     maps = {"exact signal": found.spectrum, "surrogate": smooth}
-    return found.beat, metrics, plotting.spectrum(maps, grid), "surrogate"
+    return found.beat, metrics, plotting.spectrum(maps, grid), "surrogate", maps
 
 
 def _simulate_moving_frames(
@@ -121,7 +120,8 @@ def _simulate_moving_frames(
         **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
         "wall_seconds": seconds,
     }
-    return beat, metrics, plotting.range_doppler(maps), "doppler"
+    first = {"first frame": maps.total_power[None]}
+    return beat, metrics, plotting.range_doppler(maps), "doppler", first
 
 
 # A largest sample at this part of the full scale leaves room for those of other seeds.

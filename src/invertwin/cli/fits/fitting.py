@@ -148,11 +148,8 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
         name for name in dict.fromkeys(problem.run.fitted_objects) if name in among.scene.names
     ]
     clutter = discovery.estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
-    summary = {
-        "kept": kept,
-        "share": float(clutter.echoes.sum() / observation.observed_map().sum()),
-        "strongest_m": clutter.strongest_position.tolist(),
-    }
+    share = float(clutter.echoes.sum() / observation.observed_map().sum())
+    summary = {"kept": kept, "share": share, "strongest_m": clutter.strongest_position.tolist()}
     rows = {**fits.rows, AMONG_CLUTTER: [row]}
     problem = replace(problem, notes={**problem.notes, "clutter": summary})
     fits = replace(fits, problem=problem, rows=rows)

@@ -249,11 +249,8 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[ReportPicture]:
     radar = recording.radar()
     wide = whole.predict_maps(scene, _DRAWN_CELLS, seed=problem.run.seed)
     grid, rates = wide.model.grid, wide.model.rates
-    maps = {
-        "recorded": wide.model.observe(recording)[0],
-        "twin": wide.twin_map,
-        "point target": wide.point_map,
-    }
+    maps = {"recorded": wide.model.observe(recording)[0], "twin": wide.twin_map}
+    maps["point target"] = wide.point_map
     over_rates = {
         name: MapPanel(power.amax((2, 3)).T, grid.ranges, rates, RATE_LABEL)
         for name, power in maps.items()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from rich.console import Console
 from torch import Tensor
@@ -21,7 +22,7 @@ from invertwin.cli.schema.placement import Placement, Trial
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
 from invertwin.inversion.initialisation.multi_start import Candidate
-from invertwin.links import ElementPhases, Metasurface, PanelPlacement
+from invertwin.links import ElementPhases, MapPlane, Metasurface, PanelPlacement
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.models.radio import CoverageMap
 from invertwin.scene import Scene
@@ -200,17 +201,14 @@ def _coverage(problem: problems.Problem, panel: Metasurface) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
     table, seen = _table(problem), problem.first_sensor.recording
     box = table.receivers
-    low, high = (torch.tensor(end, dtype=torch.float64) for end in (box.low, box.high))
-    side = (high - low)[:2]
-    step = float((side.prod() / _CELLS).sqrt())
-    counts = [max(2, round(float(s) / step)) for s in side]
-    axes = [torch.linspace(float(low[k]), float(high[k]), counts[k]).double() for k in range(2)]
-    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     height = 0.5 * (box.low[2] + box.high[2])
-    points = torch.cat([grid, torch.full((len(grid), 1), height)], 1)
+    side = (math.prod(np.subtract(box.high, box.low)[:2]) / _CELLS) ** 0.5
+    plane = MapPlane.horizontal(box.low[:2], box.high[:2], height, side)
+    points = plane.centres.reshape(-1, 3)
     how = {"depth": table.depth, "edges": table.edges, "seed": problem.run.seed}
     with torch.no_grad():
         aim = Coverage.of(seen.scene, seen.tx, points, table.frequency, **how)
         maps = {"without": aim.direct, "with the panel": aim.gain(panel)}
-    shown = {n: 10 * g.clamp_min(_FLOOR).log10().view(*counts) for n, g in maps.items()}
+    shown = {n: 10 * g.clamp_min(_FLOOR).log10().view(plane.shape) for n, g in maps.items()}
+    low, high = plane.corner, plane.corner + plane.first + plane.second
     return plotting.floor_plan(shown, (low, high), seen.scene, height, seen.tx, panel.position)

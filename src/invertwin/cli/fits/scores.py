@@ -53,12 +53,8 @@ def score_fit(problem: Problem, start: Scene, twin: Scene) -> Row:
         angles = score_joints(body, *(s[name].mesh for s in (start, twin, problem.truth)))
         good = angles["joint_error_after_deg"] <= settings.joint_limit_deg
         return {**angles, "success": good, "position": place, **shapes}
-    rows: Row = {
-        "start_distance_m": before.distance,
-        "position_error_m": after.distance,
-        "success": after.distance <= settings.position_limit,
-        "position": place,
-    }
+    rows: Row = {"start_distance_m": before.distance, "position_error_m": after.distance}
+    rows |= {"success": after.distance <= settings.position_limit, "position": place}
     if settings.axis is not None:
         ends = [(s[name], problem.truth[name]) for s in (start, twin)]
         (far, tilted), (near, tilt) = (axis_error(*pair, settings.axis) for pair in ends)

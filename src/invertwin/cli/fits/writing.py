@@ -219,6 +219,12 @@ def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPic
         file = f"spectra_{name}" if name else "spectra"
         figure = plotting.spectrum(titled, item.grid)
         found.append(save_picture(folder, file, figure, note="spectra"))
+        if item.grid.u_count > 1 or item.sensor.frame_count > 1:
+            del titled[titles["start"]]
+            marked = {"twin": ends["twin"]} | ({"truth": outline} if outline else {})
+            figure = plotting.from_above(titled, item.grid, item.sensor, marked)
+            file = f"above_{name}" if name else "above"
+            found.append(save_picture(folder, file, figure, "From above", "above"))
     residuals = fits.found.verdict.residuals
     for (name, item), apart in zip(problem.sensor_data.items(), residuals, strict=False):
         figure = plotting.residuals(apart, item.grid)

@@ -388,12 +388,8 @@ def _merge_table(table: Any, change: Any) -> Any:
 @cache
 def _overrides_model(run: type[_RunFile]) -> Any:
     """Runs where the run file has its parts."""
-    return create_model(
-        "Parts",
-        stages=(list[run], []),  # type: ignore[valid-type]
-        variants=(dict[str, run], {}),  # type: ignore[valid-type]
-        calibration=(run, None),
-    )
+    listed, named = (list[run], []), (dict[str, run], {})  # type: ignore[valid-type]
+    return create_model("Parts", stages=listed, variants=named, calibration=(run, None))
 
 
 def _add_plugin_sections() -> type[_RunFile]:

@@ -154,15 +154,8 @@ def register(registry: Registry) -> None:
     registry.groups["parameter"] = KindGroup(base=ParameterTable)
     registry.bases |= dict.fromkeys((scenes.PriorShape, scenes.LinearShape), LearnedTable)
     registry.bases[RadarTrajectory] = LatentTable
-    registry.given |= {
-        scenes.Scene,
-        scenes.Mesh,
-        scenes.Object,
-        ObjectTable,
-        BodyTemplate,
-        scenes.Walking,
-        scenes.Sitting,
-    }
+    bodies = {ObjectTable, BodyTemplate, scenes.Walking, scenes.Sitting}
+    registry.given |= bodies | {scenes.Scene, scenes.Mesh, scenes.Object}
     registry.groups["motion"] = KindGroup()
     registry.add("motion", "walking", scenes.Walking, checked=False)
     registry.add("motion", "sitting", scenes.Sitting, checked=False)
