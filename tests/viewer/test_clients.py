@@ -1,18 +1,21 @@
 """What clients of a viewer may say, and that nobody hinders others."""
 
 import importlib.util
+import json
 import math
 import random
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from invertwin.runtime.memory import peak_memory
+from invertwin.scene import Object, RoughDielectric, Scene, box, rigid
 from invertwin.viewer import (
     Display,
     DisplayLayer,
@@ -21,6 +24,8 @@ from invertwin.viewer import (
     InteractiveSensor,
     Viewer,
     build_display,
+    display_mesh,
+    page_html,
 )
 from invertwin.viewer.guard import is_valid_message
 from viewer.test_display import GRID, radar, scene
@@ -112,6 +117,23 @@ NAMES = (
 
 def control(viewer: Viewer, name: str) -> Any:
     return getattr(viewer, name)._impl.uuid
+
+
+def test_an_object_named_as_a_group_of_layers_moves_alone():
+    material = RoughDielectric(4.0)
+    ball = Object(box((0.4, 0.4, 0.4)), material, rigid(translation=[2.0, 0.0, 0.0]))
+    body = display_mesh(ball)
+    moved = DisplayMesh(body.vertices + np.float32(0.5), body.faces)
+    shown = build_display(Scene({"radar": ball}), {"": (radar(), GRID)}, "t", fitted=["radar"])
+    shown = replace(shown, steps=[DisplayStep(1, "step 1", {"radar": moved})])
+    with Viewer(shown, port=0) as made:
+        until(lambda: made._where.value == "step 1")
+        assert made._said.visible is False
+        vertices = made._nodes["twin/radar"].vertices
+        np.testing.assert_allclose(vertices, moved.vertices)
+    page = page_html(shown)  # the same triangles are not written again
+    data = json.loads(page.split('id="view-data">')[1].split("</script>")[0])
+    assert "faces" not in data["steps"][0]["bodies"]["twin/radar"]
 
 
 def test_values_are_those_of_the_control_and_nothing_else(viewer):

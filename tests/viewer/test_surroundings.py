@@ -83,6 +83,22 @@ def test_the_first_camera_is_behind_and_above_the_radar_and_sees_all(scale):
     assert max(np.abs(away @ right).max(), 0) / (depth.max() * half) > 0.2  # not tiny either
 
 
+def test_on_a_phone_the_scene_fits_the_width_and_stands_above_the_panel():
+    camera, shown, aspect = SimpleNamespace(), display(), 390 / 844
+    set_camera(camera, shown, aspect)
+    ahead = camera.look_at - camera.position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    right /= np.linalg.norm(right)
+    points = np.concatenate([layer.points for layer in shown.layers if layer.shown])
+    away = points - camera.position
+    half = (away @ ahead) * np.tan(camera.fov / 2)
+    assert (np.abs(away @ right) / (half * aspect)).max() < 1.0
+    heights = (away @ np.cross(right, ahead)) / half
+    assert heights.max() < 1.0
+    assert heights.mean() > 0.2  # the panel takes the lower 60 % of the window
+
+
 def test_walls_are_seen_through_from_behind_and_objects_are_not():
     shown = display()
     layers = {layer.name: layer for layer in shown.layers}

@@ -123,10 +123,8 @@ def _views(radar: Radar | None) -> list[_OrthographicView]:
 
 
 def _shapes(scene: Scene) -> dict[str, Shape]:
-    return {
-        name: (numbers(item.vertices), numbers(item.mesh.faces))
-        for name, item in scene.objects.items()
-    }
+    objects = scene.objects.items()
+    return {name: (numbers(one.vertices), numbers(one.mesh.faces)) for name, one in objects}
 
 
 def _colors(shapes: Mapping[str, Shape], highlight: Sequence[str] | None) -> dict[str, str]:

@@ -111,10 +111,8 @@ class DisplayMaps:
         frames, ranges, across, _ = next(iter(spectra.values())).shape
         count = max(1, min(frames, max_values // (len(spectra) * ranges * across)))
         chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
-        kept = {
-            name: np.asarray(power.detach()[chosen].amax(3).cpu(), np.float32)
-            for name, power in spectra.items()
-        }
+        tops = {name: power.detach()[chosen].amax(3).cpu() for name, power in spectra.items()}
+        kept = {name: np.asarray(power, np.float32) for name, power in tops.items()}
         return cls(chosen, grid.ranges.tolist(), grid.u.tolist(), kept)
 
     def maps_of_frame(self, frame: int) -> dict[str, NDArray[np.float32]]:

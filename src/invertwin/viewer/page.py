@@ -162,13 +162,14 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             simulates at every step, and says which points feed a bin. None shows what was
             measured alone.
     """
-    faces = {x.name.removeprefix("twin/"): x.faces for x in display.layers}
+    faces = {x.name: x.faces for x in display.layers}
 
     def pack_step(step: DisplayStep) -> dict[str, Any]:
         bodies = {
             # Triangles are mostly those of the layer.
             f"twin/{name}": _encode_mesh(
-                body.vertices, None if np.array_equal(body.faces, faces[name]) else body.faces
+                body.vertices,
+                None if np.array_equal(body.faces, faces[f"twin/{name}"]) else body.faces,
             )
             for name, body in step.bodies.items()
         }

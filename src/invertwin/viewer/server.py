@@ -178,6 +178,9 @@ class Viewer:
             self._draw_layer(layer)
         surroundings.draw_ground(scene, display)
         surroundings.set_camera(self._server.initial_camera, display)
+        self._server.on_client_connect(
+            lambda client: surroundings.set_camera(client.camera, display, client.camera.aspect)
+        )
 
     def _build_sensor_controls(self) -> None:
         gui, maps = self._server.gui, self._display.maps
@@ -332,7 +335,8 @@ class Viewer:
             self._mover.value = _NO_OBJECT  # what was moved stands where the step has it
         self._taken, step = state.step, self._steps[state.step]
         for layer in self._display.show_step(step).layers:
-            if layer.name.removeprefix("twin/") in step.bodies:
+            # The radar has a layer "radar": an object of that name is "twin/radar".
+            if layer.group == "twin" and layer.name.removeprefix("twin/") in step.bodies:
                 node = self._nodes[layer.name]
                 if node.faces.shape == layer.faces.shape and (node.faces == layer.faces).all():
                     node.vertices = layer.points

@@ -13,6 +13,7 @@ _ELEVATION = np.deg2rad(28.0)  # of the first camera above the sight of the rada
 _ASIDE = np.deg2rad(12.0)  # of the first camera from the sight of the radar
 _FIELD_OF_VIEW = np.deg2rad(50.0)  # of the first camera, from below to above
 _USED_TANGENT = 0.85 * np.tan(_FIELD_OF_VIEW / 2)  # of its half height, and its half width
+_PANEL_SHARE = 0.55  # of half the height by which a phone's scene stands above the middle
 _WALL_SHARE = 0.6  # of the scene's sides that a wall spans
 
 
@@ -44,12 +45,14 @@ def draw_ground(scene: Any, display: Display) -> None:
             scene.add_label(f"/ground/{name}{number}", text, position=tuple(place))
 
 
-def set_camera(camera: Any, display: Display) -> None:
+def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
     """Put the first camera behind and above the radar, so that it sees the radar and the scene.
 
     Args:
         camera: The first one of a viser server.
         display: What is shown.
+        aspect: Width of the window over its height; below 1, as on a phone, the scene is in the
+            upper part, above the panel.
     """
     up, ahead = np.array(display.up), np.array(display.ahead)
     left = np.cross(up, ahead)
@@ -59,11 +62,13 @@ def set_camera(camera: Any, display: Display) -> None:
     points = _framed_points(display)
     middle = 0.5 * (points.min(0) + points.max(0)).astype(float)
     away = points - middle
-    aside = np.maximum(np.abs(away @ right), np.abs(away @ np.cross(right, sight)))
+    above = np.cross(right, sight)
+    aside = np.maximum(np.abs(away @ right) / min(aspect, 1.0), np.abs(away @ above))
     distance = float((aside / _USED_TANGENT - away @ sight).max()) or 1.0
     camera.fov, camera.near, camera.far = _FIELD_OF_VIEW, 1e-3 * distance, 1e2 * distance
-    camera.look_at, camera.up = middle, up
-    camera.position = middle - distance * sight
+    middle -= (distance * _USED_TANGENT * _PANEL_SHARE if aspect < 1 else 0.0) * above
+    camera.up, camera.position = up, middle - distance * sight
+    camera.look_at = middle  # the last: that of a client moves with its position
 
 
 def legend_html(display: Display) -> str:

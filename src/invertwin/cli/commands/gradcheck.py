@@ -41,8 +41,7 @@ _REPORT_FIELDS = (
 )
 # Units of a derivative with respect to θ, by the value that θ changes; angles have their own.
 _DERIVATIVE_UNITS = {
-    **dict.fromkeys(("translation", "offsets", "value"), "1/m"),
-    "place": "1/m",
+    **dict.fromkeys(("translation", "offsets", "value", "place"), "1/m"),
     "log_scale": "per relative size",
     "log_density": "per relative density",
 }

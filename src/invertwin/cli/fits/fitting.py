@@ -144,9 +144,8 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     among = outcome()
     kept = wanted == "always" or discovery.choose_result(fits.found, among) is among
     observation = make_observations(problem, fits.start)[0]
-    moved = [
-        name for name in dict.fromkeys(problem.run.fitted_objects) if name in among.scene.names
-    ]
+    fitted, there = dict.fromkeys(problem.run.fitted_objects), among.scene.names
+    moved = [name for name in fitted if name in there]
     clutter = discovery.estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
     share = float(clutter.echoes.sum() / observation.observed_map().sum())
     summary = {"kept": kept, "share": share, "strongest_m": clutter.strongest_position.tolist()}
