@@ -10,7 +10,7 @@ from invertwin.channel import Grid
 from invertwin.scene.pose import rotation_from_vector
 
 GRID = Grid(1.0, 0.05, 60, -0.8, 0.05, 33)
-PLACES = [[0.0, -0.5, 0.3], [0.0, 0.5, 0.3]]
+PLACES = torch.tensor([[0.0, -0.5, 0.3], [0.0, 0.5, 0.3]]).double()
 TARGET = torch.tensor([2.0, 0.4, 0.3]).double()
 PAINT = iw.RoughDielectric(permittivity=4.0)
 
