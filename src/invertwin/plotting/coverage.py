@@ -104,7 +104,12 @@ def _names(plane: MapPlane) -> list[str]:
 
 
 def project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
-    """Sharp edges of all objects, in the plane."""
+    """Sharp edges of all objects, in the plane.
+
+    Args:
+        scene: the objects.
+        plane: the plane onto whose axes they are projected.
+    """
     lines: list[NDArray[Any]] = []
     for item in scene.objects.values():
         edges = sharp_edges(numbers(item.vertices), numbers(item.mesh.faces))

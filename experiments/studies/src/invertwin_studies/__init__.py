@@ -3,7 +3,8 @@
 A plugin of invertwin: it adds the run-file sections `[methods]` and `[loss_scan]`, the commands
 `loss-scan` and `train-prior`, the readers of two public recordings, the `[data]` kinds
 `openradar` and `rail_sar`, and the public space of vehicles, the shape `vehicle` with the unknown
-`shape_space`. Nothing in invertwin builds on it.
+`shape_space`. `mirrors` has ghosts in maps and fields, to be called from Python. Nothing in
+invertwin builds on it.
 """
 
 from typing import Any

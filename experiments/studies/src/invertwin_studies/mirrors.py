@@ -10,12 +10,12 @@ Source: the radar equation with the legs of derivations §10; boundary terms of 
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from jaxtyping import Complex128, Float32, Float64, Int64
+from jaxtyping import Complex128, Float, Float32, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.coherent.field import trace_field
@@ -29,6 +29,7 @@ from invertwin.channel.em.depolarisation import random_scattering_matrix
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Grid, Link, Paths, concatenate_paths
 from invertwin.channel.power.bins import deposit_paths
+from invertwin.channel.power.deposit import deposit_power
 from invertwin.channel.rays import ray_scene, scene_tables
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.sampling import Sampling
@@ -37,6 +38,8 @@ from invertwin.channel.specular.image_method import find_paths_from
 from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.models.radar import SurrogateMap
+from invertwin.radar.radar import Radar
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Scene
 from invertwin.scene.material.fresnel import FieldCoefficients
@@ -47,6 +50,28 @@ _Evaluation = Callable[[Link, ScatteredPairs, MaterialPoints, SurfacePaths], dic
 _SEARCH_RAYS = 100_000
 _FEW_TRIANGLES = 48  # that reflect or transmit: every sequence of their planes is tested
 _RAYS_PER_POINT = 64  # rays of power paths at the cost of one point
+
+
+@dataclass(frozen=True)
+class MirroredMap(SurrogateMap):
+    """A map in which smooth flat objects show everything else a second time (ghosts).
+
+    Attributes:
+        mirrors: names of the smooth flat objects, such as a wall or a floor. Paths meet up to
+            ``sampling.depth`` surfaces and scatter once.
+    """
+
+    mirrors: Sequence[str] = ()
+
+    def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
+        """The expected power spectrum. See ``ForwardModel.predict``."""
+        link = sensor.link()
+        rest = single_scattering.without_specular(scene, self.mirrors)
+        deposit = deposit_power(rest, link, self.grid, sampling=self.sampling, seed=seed)
+        deposit = deposit + deposit_mirrored_power(
+            scene, link, self.grid, self.mirrors, sampling=self.sampling, seed=seed
+        )
+        return self.kernels.shape(deposit, sensor, self.grid).clamp_min(0.0)
 
 
 def deposit_mirrored_power(
@@ -74,8 +99,8 @@ def deposit_mirrored_power(
         seed: random seed of the points.
 
     Raises:
-        InputError: mirrors that the scene lacks or that reflect no coherent wave; derivatives
-            where a moving surface touches one that scatters.
+        InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
+            motion; derivatives where a moving surface touches one that scatters.
     """
     rest = single_scattering.without_specular(scene, mirrors)
 
@@ -104,31 +129,27 @@ def trace_field_with_mirrors(
     """Trace field paths as ``trace_field``, and those by mirrors.
 
     Conductors scatter by physical optics, rough surfaces by their fixed points with the phases that
-    they have in direct echoes. A path by mirrors has the velocity of its point, mirrored where an
-    antenna sees the image.
+    they have in direct echoes.
 
     Args:
         scene: scene with surfaces.
         link: antennas, per frame.
         mirrors: names of the smooth flat objects that reflect; without any, ``trace_field``.
-        sampling: numbers of points; ``depth`` is the maximum number of surfaces on a path. Where
-            objects move, other paths than those by mirrors have one bounce.
+        sampling: numbers of points; ``depth`` is the maximum number of surfaces on a path.
         seed: random seed of the points.
         speckle: rough points; None draws them.
 
     Raises:
-        InputError: mirrors that the scene lacks, that reflect no coherent wave, or that move;
-            derivatives with respect to geometry with ``boundary``, which single points lack; and
-            errors of ``trace_field``.
+        InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
+            motion; derivatives with respect to geometry with ``boundary``, which single points
+            lack; and errors of ``trace_field``.
     """
     rest = single_scattering.without_specular(scene, mirrors)
-    moves = any(item.velocity is not None for item in scene.objects.values())
-    own = replace(sampling, depth=1) if mirrors and moves else sampling
-    direct = trace_field(rest, link, sampling=own, seed=seed, speckle=speckle)
+    direct = trace_field(rest, link, sampling=sampling, seed=seed, speckle=speckle)
     if not mirrors:
         return direct
     with tracing(sampling.backend), torch_threads(1):
-        geometry = scene_tables.flatten(rest, link.wavelength, motion="fixed")
+        geometry = scene_tables.flatten(rest, link.wavelength)
         if sampling.boundary and scene_tables.is_visibility_differentiated(geometry, link):
             raise InputError(
                 "expected no geometry derivative of fields by mirrors, got one: single points "
@@ -161,26 +182,16 @@ def _prepare(
     """Prepare the search for legs between the antennas of each frame by the mirrors alone."""
     frequency = SPEED_OF_LIGHT / link.wavelength
     for name in mirrors:
-        if name not in scene.names:
-            raise InputError(
-                f"expected mirrors among the objects {', '.join(scene.names)}, got {name!r}; use "
-                "one of these names"
-            )
         skin = scene[name].material.smooth_interface(frequency)
         if skin is None or not bool((skin.coherence > 0).any()):
             raise InputError(
                 f"expected mirrors that reflect a coherent wave, got {name!r}, all of whose power "
                 "is scattered; give it a Slab, a PerfectConductor, or Dielectric(scattering=0)"
             )
-        if scene[name].velocity is not None:
-            raise InputError(
-                f"expected mirrors at rest, got a velocity on {name!r}; remove it, or the mirror"
-            )
     flat = scene
     for name in set(scene.names) - set(mirrors):
         flat = flat.replace(name, material=_NonReflecting(scene[name].material))
     stage = trace_paths.prepare_path_scene(flat, link.tx, link.rx, frequency)
-    stage = replace(stage, velocities=None)
     pairing: single_scattering.Pairing = "monostatic" if link.shared_visibility else "frames"
     active = trace_paths.face_interactions(stage)
     few = int((active.reflect | active.transmit).sum()) <= _FEW_TRIANGLES

@@ -1,0 +1,182 @@
+"""Echoes by mirrors (ghosts): image antennas, the flash of a wall, derivatives and refusals."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from invertwin.channel import Grid, Link, Sampling, deposit_power, draw_speckle, trace_field
+from invertwin.channel.coverage.single_scattering import without_specular
+from invertwin.errors import InputError
+from invertwin.scene import (
+    Dielectric,
+    Isotropic,
+    Material,
+    Object,
+    PerfectConductor,
+    RoughDielectric,
+    Scene,
+    box,
+    plate,
+    rigid,
+    rotation_from_vector,
+    sphere,
+)
+from invertwin_studies.mirrors import deposit_mirrored_power, trace_field_with_mirrors
+from scenes import float64
+
+WAVELENGTH = 0.004
+GRID = Grid(0.4, 0.05, 120)
+ORIGIN = float64([[0.0, 0.0, 0.0]])
+IMAGE = float64([[0.0, -1.0, 0.0]])  # of the origin in the wall
+SAMPLING = Sampling(3, 400_000, boundary_samples=20_000, conductor_samples=20_000)
+PAINT = RoughDielectric(5.0)
+
+
+def link(tx: Tensor = ORIGIN, rx: Tensor = ORIGIN, *, shared: bool = True) -> Link:
+    turn = torch.eye(3, dtype=torch.float64)[None]
+    return Link(tx, rx, turn, Isotropic(), Isotropic(), WAVELENGTH, shared)
+
+
+def wall(material: Material, size: float = 8.0, shift: Tensor | float = 0.0) -> Object:
+    along = rotation_from_vector(float64([0.0, 0.0, math.pi / 2]))
+    across = float64([0.0, 1.0, 0.0]) * shift
+    return Object(plate(size, size), material, rigid(along, float64([1.5, -0.5, 0.0]) + across))
+
+
+def ball(material: Material = PAINT) -> Object:
+    return Object(sphere(0.1, 3), material, rigid(translation=float64([3.0, 0.4, 0.0])))
+
+
+def powers(scene: Scene, of: Link | None = None, **how: int) -> Tensor:
+    sampling = replace(SAMPLING, **how)
+    how_drawn = {"sampling": sampling, "seed": 1}
+    return deposit_mirrored_power(scene, of or link(), GRID, ["wall"], **how_drawn)[0, :, 0, 0]
+
+
+def seen_by_images(target: Object) -> Tensor:
+    """The two mixed paths and that by the wall on both legs, with image antennas and no wall."""
+    free, how = Scene({"ball": target}), {"sampling": replace(SAMPLING, depth=1), "seed": 1}
+    mixed = deposit_power(free, link(IMAGE, shared=False), GRID, **how)
+    return (2 * mixed + deposit_power(free, link(IMAGE, IMAGE), GRID, **how))[0, :, 0, 0]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_ghosts_are_those_of_image_antennas(shared):
+    target = ball()
+    mirrored = powers(
+        Scene({"ball": target, "wall": wall(PerfectConductor())}), link(shared=shared)
+    )
+    expected = seen_by_images(target)
+    far = GRID.ranges > 2
+    assert float(mirrored[far].sum() / expected[far].sum()) == pytest.approx(1, abs=0.01)
+    loud = far & (expected > 0.1 * expected[far].max())
+    torch.testing.assert_close(mirrored[loud], expected[loud], rtol=0.02, atol=0)
+
+
+def test_the_flash_of_the_wall_is_the_image_of_the_radar():
+    index = math.sqrt(5.0)
+    reflectance = ((index - 1) / (index + 1)) ** 2
+    material = Dielectric(5.0, scattering=0.0)
+    flash = powers(Scene({"ball": ball(), "wall": wall(material)}))[GRID.ranges < 1]
+    friis = (WAVELENGTH / (4 * math.pi * 1.0)) ** 2  # at twice the distance of 0.5 m
+    assert float(flash.sum()) == pytest.approx(reflectance * friis, rel=1e-4)
+    assert float((flash * GRID.ranges[GRID.ranges < 1]).sum() / flash.sum()) == pytest.approx(0.5)
+
+
+def test_without_bounces_to_spare_there_is_no_ghost():
+    scene = Scene({"ball": ball(), "wall": wall(PerfectConductor())})
+    assert not powers(scene, depth=1).any()
+    far = GRID.ranges > 2
+    one, two = (powers(scene, depth=depth)[far].sum() for depth in (2, 3))
+    assert float(one) < 0.8 * float(two)  # the path by the wall on both legs is left out
+
+
+def test_fields_of_rough_points_have_the_power_of_the_map():
+    scene = Scene({"ball": ball(), "wall": wall(Dielectric(5.0, scattering=0.0))})
+    sampling = replace(SAMPLING, points_per_m2={"ball": 40_000.0, "*": 1.0})
+    rest, how = without_specular(scene, ["wall"]), {"sampling": sampling, "seed": 2}
+    speckle = draw_speckle(rest, link(), **how)
+    paths = trace_field_with_mirrors(scene, link(), ["wall"], speckle=speckle, **how)
+    direct = trace_field(rest, link(), speckle=speckle, **how)
+    ghosts = paths.coefficient.abs().square()[len(direct) :]
+    total = ghosts[paths.range[len(direct) :] > 2].sum()
+    expected = powers(scene)[GRID.ranges > 2].sum()
+    assert float(total / expected) == pytest.approx(1, abs=0.04)
+
+
+def test_a_conductor_in_the_mirror_has_the_field_of_the_image_antenna():
+    target = Object(
+        plate(0.2, 0.2), PerfectConductor(), rigid(translation=float64([3.0, 0.4, 0.0]))
+    )
+    scene = Scene({"target": target, "wall": wall(PerfectConductor())})
+    paths = trace_field_with_mirrors(scene, link(), ["wall"], sampling=SAMPLING, seed=2)
+    turns = torch.polar(torch.ones_like(paths.delay), -2 * math.pi * 3e8 / WAVELENGTH * paths.delay)
+    once = (paths.range - 3.17).abs() < 0.07  # 3.03 m directly, 3.31 m by the wall on both legs
+    found = (paths.coefficient * turns)[once].sum().abs()
+    sampling = replace(SAMPLING, depth=1)
+    free = trace_field(
+        Scene({"target": target}), link(IMAGE, shared=False), sampling=sampling, seed=2
+    )
+    turns = torch.polar(torch.ones_like(free.delay), -2 * math.pi * 3e8 / WAVELENGTH * free.delay)
+    expected = 2 * (free.coefficient * turns).sum().abs()  # both orders, in phase
+    assert float(found / expected) == pytest.approx(1, abs=0.02)
+
+
+def crate(shift: Tensor, aside: Tensor, permittivity: Tensor) -> Scene:
+    """A crate behind a post, beside a wall that ends."""
+    turned = rotation_from_vector(float64([0.0, 0.0, 0.4]))
+    place = float64([3.0, 0.41, 0.0]) + float64([0.0, 1.0, 0.0]) * shift
+    return Scene(
+        {
+            "crate": Object(box(0.3), PAINT, rigid(turned, place)),
+            "wall": wall(Dielectric(permittivity, scattering=0.0), 1.5, aside),
+            "post": Object(
+                box((0.1, 0.1, 1.0)),
+                RoughDielectric(1.0),
+                rigid(translation=float64([2.2, 0.05, 0.0])),
+            ),
+        }
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "step"), [("crate", 0.01), ("wall", 0.01), ("epsilon", 0.2)])
+def test_derivatives_are_those_of_differences(name, step):
+    weights = torch.linspace(1.0, 3.0, GRID.range_count)
+    start = {"crate": 0.0, "wall": 0.0, "epsilon": 5.0}
+
+    def loss(value: Tensor, **how: int) -> Tensor:
+        given = {key: float64(number) for key, number in start.items()} | {name: value}
+        return 1e12 * (powers(crate(*given.values()), **how) * weights)[GRID.ranges > 2].sum()
+
+    slopes = []
+    for boundary in (20_000, 0):
+        value = float64(start[name]).requires_grad_()
+        how = {"samples": 3_200_000, "boundary_samples": boundary}
+        slopes.append(torch.autograd.grad(loss(value, **how), value)[0].item())
+    with torch.no_grad():
+        ends = [loss(float64(start[name] + s * step), samples=9_600_000) for s in (1, -1)]
+    difference = float(ends[0] - ends[1]) / (2 * step)
+    assert slopes[0] == pytest.approx(difference, rel=0.03)
+    if name == "crate":
+        assert slopes[1] != pytest.approx(difference, rel=0.2)  # what becomes hidden counts
+
+
+def test_what_is_no_mirror_is_named():
+    scene = Scene({"ball": ball(), "wall": wall(PAINT)})
+    with pytest.raises(InputError, match=r"expected mirrors that reflect a coherent wave"):
+        powers(scene)
+    how = {"sampling": SAMPLING, "seed": 1}
+    with pytest.raises(InputError, match=r"in the scene: ball, wall, got 'floor'"):
+        deposit_mirrored_power(scene, link(), GRID, ["floor"], **how)
+    smooth = Scene(
+        {
+            "ball": replace(ball(), velocity=float64([1.0, 0.0, 0.0])),
+            "wall": wall(PerfectConductor()),
+        }
+    )
+    with pytest.raises(InputError, match=r"expected objects at rest, got velocities on ball"):
+        powers(smooth)
