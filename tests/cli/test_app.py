@@ -105,7 +105,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     names = {p.name for p in out.iterdir()}
     assert names == {
         *(".invertwin.json", "metrics.json", "run.toml", "report.html", "twin.ply"),
-        *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png"),
+        *("checkpoint.pt", "scene.png", "spectra.png", "loss.png", "landscape.png", "above.png"),
         *("residuals.png", "view.npz"),
     }
     metrics = read_metrics(out)
