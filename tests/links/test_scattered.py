@@ -332,7 +332,7 @@ def test_surfaces_that_meet_and_move_are_refused_by_name():
     scene = Scene({**BESIDE_MIRROR.objects, "box": Object(CRATE, PerfectConductor(), pose)})
     sampling = Sampling(depth=1, samples=1000, boundary_samples=1000)
     reception = PropagationSettings(FREQUENCY, depth=2, rays=None, rough=sampling)
-    with pytest.raises(InputError, match="wall and box in contact; leave a gap"):
+    with pytest.raises(InputError, match="box and wall in contact; leave a gap"):
         reception.rough_moments(scene, MAST, SPOTS, 0)
     reception = replace(reception, rough=replace(sampling, contacts=False))
     reception.rough_moments(scene, MAST, SPOTS, 0).sum().backward()
