@@ -22,6 +22,10 @@ _MIN_PLANE_SINE = 1e-7  # least sine of the angle between two planes that cross
 _EDGE_EXTENSION = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
 _MAX_HITS = 64  # surfaces that an edge may pass
 
+_PASSES = (
+    -2
+)  # instead of a side's edge (−1: it has none): no side in the plane, or it goes on beyond
+
 
 @dataclass(frozen=True)
 class IntersectionCurves(Rows):
@@ -203,7 +207,7 @@ def intersect_triangles(
         mine = height.gather(1, apex)
         across = (nearby >= 0) & (edge >= 0)[:, None] & (there * mine < 0)
         across = (across & (there.abs() >= PLANE_TOLERANCE)).any(1)
-        resting.append(torch.where(lies & ~across, edge, -1))
+        resting.append(torch.where(lies & ~across, edge, _PASSES))
         kept &= ~(lies & across & (mine[:, 0] > 0))  # the triangle on the other side has it
         spans.append(_line_interval(triangles[own], height, line))
     (low, high, place), (others_low, others_high, _) = spans
@@ -213,8 +217,9 @@ def intersect_triangles(
     ends = (place + line * (value - at)[:, None] for value in (low, high))
     start, end = (value[kept] for value in ends)
     rests, supports = (edge[kept] for edge in resting)
-    touching, swapped = (rests >= 0) | (supports >= 0), (supports >= 0) & (rests < 0)
-    edge = torch.where((rests >= 0) & (supports >= 0), -1, torch.maximum(rests, supports))
+    touching, swapped = torch.maximum(rests, supports) > _PASSES, (supports >= 0) & (rests < 0)
+    edge = torch.maximum(rests, supports).clamp_min(-1)
+    edge = torch.where((rests >= 0) & (supports >= 0), -1, edge)
     pair = first[kept], second[kept]
     first, second = (torch.where(swapped, pair[1 - k], pair[k]) for k in (0, 1))
     return IntersectionCurves(first, second, start, end, touching, edge)
