@@ -22,9 +22,8 @@ _MIN_PLANE_SINE = 1e-7  # least sine of the angle between two planes that cross
 _EDGE_EXTENSION = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
 _MAX_HITS = 64  # surfaces that an edge may pass
 
-_PASSES = (
-    -2
-)  # instead of a side's edge (−1: it has none): no side in the plane, or it goes on beyond
+# Instead of a side's edge (−1: it has none): no side in the plane, or the surface goes on beyond.
+_PASSES = -2
 
 
 @dataclass(frozen=True)
