@@ -118,7 +118,7 @@ def test_reconstruct_writes_a_whole_folder(run_file, monkeypatch, capsys):
     assert 0.1 < metrics["peak_memory_gb"] < 8
     assert load_run(out / "run.toml").seed == 5
     report = (out / "report.html").read_text()
-    assert report.count("data:image/png;base64,") == 5
+    assert report.count("data:image/png;base64,") == 6
     assert "plate.x [m]" in report
     said = capsys.readouterr().out
     assert "plate.x [m]" in said
