@@ -1,5 +1,6 @@
 """Chirp-resolved samples: their settings, and how they become a capture."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -100,6 +101,15 @@ def test_real_samples_become_analytic():
     torch.testing.assert_close(data.beat[:, 0], data.to_chirp_capture(ARRAYS).to_capture(0).beat)
     beat = data.to_chirp_capture(ARRAYS).to_capture("mean").beat
     torch.testing.assert_close(beat[1, 2, 3].to(torch.complex128), echo, atol=1e-6, rtol=0)
+
+
+def test_an_analytic_signal_needs_memory(monkeypatch):
+    settings = replace(SETTINGS, real=True, samples=64)
+    data = ChirpData(torch.ones(2, 4, 3, 4, 64, dtype=torch.complex64), settings)
+    for free, fits in ((56.0 * data.samples.numel(), True), (55.0 * data.samples.numel(), False)):
+        monkeypatch.setattr("invertwin.runtime.memory.free_memory", lambda free=free: free)
+        with nullcontext() if fits else pytest.raises(InputError, match="give fewer frames"):
+            assert data.beat.shape == data.samples.shape
 
 
 def test_counts_are_scaled_rounded_and_clipped():

@@ -20,6 +20,7 @@ from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps, check_order
 from invertwin.radar.waveform import FMCW, PhysicsWarning
+from invertwin.runtime.memory import require_memory
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
 IdleTime = Annotated[limits.NonNegative, limits.UsualValue("seconds", 5e-6, high=1.0)]
@@ -165,6 +166,9 @@ class ChirpData:
         """
         if not self.settings.real:
             return self.samples
+        # Of every sample 8 bytes as a double, and 16 each of spectrum, halved spectrum, result.
+        need, do = 56.0 * self.samples.numel(), "give fewer frames"
+        require_memory(need, "the analytic signal of real samples", do)
         analytic = np.asarray(hilbert(self.samples.real.numpy().astype(np.float64), axis=-1))
         return torch.from_numpy(analytic)
 

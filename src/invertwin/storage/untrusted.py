@@ -109,7 +109,7 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
     if not file.is_file():
         kind = "a folder" if file.is_dir() else "a pipe or a device"
         raise InputError(f"expected {what}, got {kind}, {file}; name a file")
-    if _expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
+    if expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
         raise InputError(
             f"expected {what}, got {file}, {known.st_size / 1e9:.2g} GB of holes; copy it again"
         )
@@ -135,8 +135,13 @@ def named_file(path: str | Path, name: str) -> Path:
     return file
 
 
-def _expands(size: int, stored: int) -> bool:
-    """Return True for many more bytes than are stored."""
+def expands(size: int, stored: int) -> bool:
+    """Return True if data of a small file need far more memory than the file has bytes.
+
+    Args:
+        size: Bytes that the data take in memory.
+        stored: Bytes of the file.
+    """
     return size > max(_MAX_EXPANDED, _MAX_EXPANSION * stored)
 
 
@@ -211,7 +216,7 @@ def read_arrays(
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
             if names is None or name in names:
-                if _expands(entry.file_size, entry.compress_size):
+                if expands(entry.file_size, entry.compress_size):
                     raise ValueError(f"{entry.file_size / 1e9:.2g} GB in {name} of a small file")
                 with archive.open(entry) as opened:
                     _check_header(opened, entry.file_size)

@@ -233,6 +233,18 @@ def test_variables_and_damage(tmp_path, file):
             read_chirps(tmp_path / "adc.toml")
 
 
+def test_bytes_of_a_small_file_do_not_become_gigabytes(tmp_path, described):
+    """The bytes are within the budget of an archive; the complex numbers from them are not."""
+    path = described(None, 'file = "adc.npy"', 'file = "adc.npz"\nvariable = "adc"')
+    for count in (2**14, 2**15 + 1):
+        zeros = np.zeros((1, count, 64, 8), dtype=np.int8)
+        np.savez_compressed(tmp_path / "adc.npz", adc=zeros)
+        if count == 2**14:
+            assert read_chirps(path).samples.numel() == zeros.size
+    with pytest.raises(InputError, match=r"recorded samples in adc\.npz, got 1\.68e\+07 numbers"):
+        read_chirps(path)
+
+
 def test_other_files_are_refused(tmp_path, described):
     with pytest.raises(InputError, match="no file"):
         read_chirps(tmp_path / "missing.toml")
