@@ -364,7 +364,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     whole = path.read_bytes()
     for size in (0, 7, len(whole) // 2, len(whole) - 100):
         path.write_bytes(whole[:size])
-        with pytest.raises(InputError, match="damaged or of another kind"):
+        with pytest.raises(InputError, match=r"damaged or of another kind|an empty file"):
             Capture.load(path)
     with pytest.raises(InputError, match="existing folder"):
         beat_capture().save(tmp_path / "nowhere" / "capture.nc")

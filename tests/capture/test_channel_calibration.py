@@ -113,7 +113,7 @@ def test_files_that_are_none_are_refused(tmp_path):
     path = tmp_path / "board.json"
     for content in ("", "[]", "{}", '{"gains": [[1, 2]]}', '{"gains": "many"}'):
         path.write_text(content)
-        with pytest.raises(InputError, match="damaged"):
+        with pytest.raises(InputError, match=r"damaged|an empty file"):
             ChannelCalibration.load(path)
 
 

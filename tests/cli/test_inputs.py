@@ -33,8 +33,8 @@ main()
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "wrong.toml").write_text(WRONG_BOARD)
-    (tmp_path / "raw.bin").write_bytes(b"")
-    (tmp_path / "raw.cfg").write_text("")
+    (tmp_path / "raw.bin").write_bytes(b"\0\0")
+    (tmp_path / "raw.cfg").write_text("% of a board\n")
     (tmp_path / "empty").mkdir()
     return tmp_path
 

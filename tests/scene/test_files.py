@@ -228,7 +228,7 @@ def ply(vertex: str) -> str:
         ("missing.ply", None, "an existing file, got .*missing.ply"),
         (
             "mesh.step",
-            b"",
+            b"ISO-10303-21;",
             r"a mesh file of .obj, .*got '.step'; convert mesh.step",
         ),
         ("empty.obj", b"", "empty.obj"),
@@ -419,7 +419,7 @@ def to_world(content: str) -> str:
     ("content", "message"),
     [
         ("<scene", "expected an XML scene"),
-        ("", "expected an XML scene"),
+        ("", "got an empty file"),
         ("<scene version='3.0.0'/>", "at least one named object"),
         ("<mesh/>", "expected one <scene> without <include>, got <mesh>"),
         ("<scene><include filename='a.xml'/></scene>", "without <include>"),

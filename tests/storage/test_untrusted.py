@@ -117,6 +117,16 @@ def test_headers_that_lie_are_refused_before_memory_is_asked_for(tmp_path):
         read_arrays(tmp_path / "b.npz", "copy it again")
 
 
+def test_an_empty_file_is_refused_before_it_is_opened(tmp_path):
+    """Such as those of /proc, which have no size and can block their reader."""
+    (tmp_path / "a.toml").touch()
+    for read in (load_run, read_npy, load_mesh):
+        with pytest.raises(
+            InputError, match=r"got an empty file, .*a\.toml; name a file with data"
+        ):
+            read(tmp_path / "a.toml")
+
+
 def test_an_archive_that_expands_beyond_reason_is_refused(tmp_path):
     """By what it says of itself: no byte of the array is read."""
     file = tmp_path / "bomb.npz"

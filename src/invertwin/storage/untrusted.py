@@ -97,7 +97,7 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
         what: What it should be, for the error.
 
     Raises:
-        InputError: No such file, a name that cannot be one, or a file of holes.
+        InputError: No such file, a name that cannot be one, an empty file, or one of holes.
     """
     file = Path(path)
     try:
@@ -106,9 +106,10 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
         raise InputError(
             f"expected {what}, got no file {str(file)[:300]}; check the path"
         ) from None
-    if not file.is_file():
+    if not file.is_file() or not known.st_size:  # as those of /proc, which can block their reader
         kind = "a folder" if file.is_dir() else "a pipe or a device"
-        raise InputError(f"expected {what}, got {kind}, {file}; name a file")
+        kind = "an empty file" if file.is_file() else kind
+        raise InputError(f"expected {what}, got {kind}, {file}; name a file with data")
     if expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
         raise InputError(
             f"expected {what}, got {file}, {known.st_size / 1e9:.2g} GB of holes; copy it again"

@@ -229,7 +229,7 @@ def test_variables_and_damage(tmp_path, file):
     whole = (tmp_path / file).read_bytes()
     for size in (0, 7, len(whole) // 2):
         (tmp_path / file).write_bytes(whole[:size])
-        with pytest.raises(InputError, match="damaged or of another kind"):
+        with pytest.raises(InputError, match=r"damaged or of another kind|an empty file"):
             read_chirps(tmp_path / "adc.toml")
 
 

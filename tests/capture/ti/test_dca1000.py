@@ -209,7 +209,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
     path.write_bytes(b"\0" * 4321)
     with pytest.raises(InputError, match=r"odd number of bytes \(4321\)"):
         read_samples(path, SETTINGS)
-    path.write_bytes(b"")
+    path.write_bytes(b"\0" * 2)
     with pytest.raises(InputError, match="no one or two changes of the settings fit"):
         read_samples(path, SETTINGS)
     with pytest.raises(InputError, match="at least one frame of 720 bytes"):
