@@ -101,7 +101,7 @@ def convert_file(path: Path) -> tuple[str, dict[Path, np.ndarray]]:
         wanted = changes.apply()
     except KeyInputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+    except (AttributeError, IndexError, KeyError, RecursionError, TypeError, ValueError):
         validate_run(raw | {"frame": FRAME}, path)  # says what is wrong in it
         raise
     validate_run(wanted, path)

@@ -22,7 +22,18 @@ from torch import nn
 
 from cli.small import GRADCHECK, RUN, STARTS
 from fuzz.damage import RAN, SOUND, Files
-from invertwin.capture import Capture, ChannelCalibration, ChirpData, ChirpSettings, read, ti
+from invertwin.capture import (
+    Capture,
+    ChannelCalibration,
+    ChirpData,
+    ChirpSettings,
+    load_rcs,
+    load_touchstone,
+    read,
+    read_topic,
+    read_track,
+    ti,
+)
 from invertwin.capture.readers.described_arrays import write_chirps
 from invertwin.cli.commands.check import run_check
 from invertwin.cli.run_file import load_run, to_toml
@@ -59,6 +70,7 @@ from invertwin.viewer import (
     page_html,
 )
 from invertwin.viewer.guard import is_valid_message
+from invertwin_convert import convert_file
 
 ALL = ("bytes", "words", "values", "special")
 
@@ -116,6 +128,11 @@ def _runs() -> list[Files]:
         {"run.toml": checked.encode()},
         {"run.toml": file.encode(), "part.ply": mesh},
     ]
+
+
+def _old_runs() -> list[Files]:
+    """Run files of the first frame, which `invertwin convert` reads."""
+    return [{"run.toml": files["run.toml"].replace(b"frame = 2", b"")} for files in _runs()]
 
 
 # Numbers without physical limits: what is estimated before a run begins
@@ -233,6 +250,8 @@ def _meshes() -> list[Files]:
 
     return [
         {"part.obj": _OBJ, "part.mtl": _MTL},
+        {"ucd.inp": _UCD},
+        {"abaqus.inp": _ABAQUS},
         *_written(
             exported("box.stl"),
             exported("text.stl", file_type="stl_ascii"),
@@ -244,6 +263,29 @@ def _meshes() -> list[Files]:
             xml,
         ),
     ]
+
+
+_UCD = b"""# AVS UCD
+4 2 0 0 0
+10 0.0 0.0 0.0
+11 1.0 0.0 0.0
+12 1.0 1.0 0.0
+13 0.0 1.0 0.5
+1 1 quad 10 11 12 13
+2 1 tri 11 13 12
+"""
+_ABAQUS = b"""*HEADING
+*NODE
+1, 0, 0, 0
+2, 1, 0, 0
+3, 0, 1, 0
+4, 1, 1, 1
+*ELEMENT, TYPE=S4R
+1, 1, 2, 4, 3
+*ELEMENT, TYPE=STRI3
+2, 1, 2,
+3
+"""
 
 
 def _read_mesh(path: Path) -> None:
@@ -679,8 +721,75 @@ def _run_in_folder(path: Path) -> None:
     assert ended.returncode == 0, ended.stderr[-300:]
 
 
+# Signatures, and bags of ROS
+
+_ONE_PORT = b"""! by hand
+# GHz S RI R 50
+3 0.3 -0.4
+4 0.2 -0.1
+"""
+_TWO_PORTS = b"""# MHz S DB R 75
+100 -6.0206 0 -20 90 -40 180 0 -90   ! S11 S21 S12 S22
+200 -6.0206 0 -20 90
+    -40 180 0 -90
+50 1.0 0.5 20 0.3
+"""
+_VERSION_2 = b"""[Version] 2.0
+# GHz S RI R 50
+[Number of Ports] 2
+[Two-Port Data Order] 12_21
+[Number of Frequencies] 2
+[Reference]
+50 50
+[Network Data]
+1 0.5 0 0.01 0 0 0.1 0.4 0
+2 0.5 0 0.01 0 0 0.1 0.4 0
+[End]
+"""
+
+
+def _signatures() -> list[Files]:
+    return [
+        {"plate.txt": b"1e9 90.0 0.0 -3.5\n1e9 90.0 45.0 -20.0\n"},
+        {"horn.s1p": _ONE_PORT},
+        {"horn.s2p": _TWO_PORTS},
+        {"pair.s2p": _VERSION_2},
+    ]
+
+
+def _read_signature(path: Path) -> None:
+    (load_rcs if path.suffix == ".txt" else load_touchstone)(path)
+
+
+def _bags() -> list[Files]:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kinds, kind = store.types, "geometry_msgs/msg/PointStamped"
+
+    def write(folder: Path) -> str:
+        with Writer(folder / "drive.bag") as out:
+            connection = out.add_connection("/p", kind, typestore=store)
+            for n in range(3):
+                stamp = kinds["builtin_interfaces/msg/Time"](sec=n, nanosec=5)
+                header = kinds["std_msgs/msg/Header"](seq=n, stamp=stamp, frame_id="r")
+                point = kinds["geometry_msgs/msg/Point"](x=1.0 * n, y=2.0, z=3.0)
+                raw = store.serialize_ros1(kinds[kind](header=header, point=point), kind)
+                out.write(connection, n, raw)
+        return "drive.bag"
+
+    return _written(write)
+
+
+def _read_bag(path: Path) -> None:
+    read_track(path, "/p")
+    read_topic(path, "/p", "point.x")
+
+
 FORMATS: dict[str, Format] = {
     "run_file": Format(_runs, _read_run, ("words", "values", "values", "special")),
+    "old_run_file": Format(_old_runs, convert_file, ("words", "values", "values", "special")),
     "mesh": Format(_meshes, _read_mesh),
     "capture": Format(
         _captures, _read_capture, ("bytes", "values", "values", "values", "special"), short=30
@@ -695,6 +804,8 @@ FORMATS: dict[str, Format] = {
     "checkpoint": Format(_checkpoints, _read_checkpoint, ("bytes", "values", "values", "special")),
     "view": Format(_views, _read_view, ("bytes", "values", "values", "special")),
     "data_set": Format(_data_sets, _read_data_set, ("bytes", "values", "values", "special")),
+    "signature": Format(_signatures, _read_signature),
+    "bag": Format(_bags, _read_bag, ("bytes", "values", "special")),
     "message": Format(_messages, _read_message, ("bytes", "words", "values")),
     "manifest": Format(_manifests, _read_manifest, intact=("victim", "notes.txt")),
     "estimate": Format(_estimates, _read_estimate, ("numbers",), short=20),

@@ -8,6 +8,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import trimesh
+from trimesh.exchange import gltf
 
 from invertwin.capture import Capture, ChannelCalibration
 from invertwin.capture.ti.sdk_cfg import read_cfg
@@ -66,6 +68,18 @@ def test_a_mesh_whose_materials_are_a_pipe_is_read(tmp_path):
     os.mkfifo(tmp_path / "part.mtl")
     (tmp_path / "part.obj").write_text("mtllib part.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert load_mesh(tmp_path / "part.obj").faces.tolist() == [[0, 1, 2]]
+
+
+def test_buffers_of_holes_are_not_read(tmp_path):
+    """A model of a kilobyte names its buffers; they are limited as the file itself is."""
+    export = gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
+    for name, content in export.items():
+        (tmp_path / name).write_bytes(content)
+    assert load_mesh(tmp_path / "model.gltf").faces.shape == (12, 3)
+    with (tmp_path / "gltf_buffer_0.bin").open("wb") as file:
+        file.truncate(3 << 30)
+    with pytest.raises(InputError, match=r"3\.2 GB of holes"):
+        load_mesh(tmp_path / "model.gltf")
 
 
 def test_groups_of_materials_are_counted_first(tmp_path):

@@ -174,3 +174,14 @@ def test_links_within_a_file_are_followed_and_loops_are_refused(tmp_path):
     ]
     with pytest.raises(InputError, match="expected a whole HDF5 file"):
         read_isolated(tmp_path / "a.h5", "hdf5", "loop")
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "matlab", "netcdf"])
+def test_fill_values_do_not_become_gigabytes(tmp_path, kind):
+    """A trusted file is read without limits of memory; none of 1 kB holds 2^25 numbers."""
+    path = tmp_path / "sparse.h5"
+    with h5py.File(path, "w") as opened:
+        opened.create_dataset("adc", (2**25,), "f4", chunks=(2**20,), fillvalue=1.0)
+    assert path.stat().st_size < 10_000
+    with pytest.raises(ValueError, match=r"3\.36e\+07 numbers in adc of a small file"):
+        read_isolated(path, kind, "adc", trusted=True)

@@ -260,11 +260,14 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
 
 
 class _FileResolver(FilePathResolver):
-    """Files that a mesh names, such as its materials: in its folder, and no pipes."""
+    """Files that a mesh names, such as its materials: in its folder, no pipes and no holes."""
 
     def get(self, name: str) -> bytes:
-        if not untrusted.named_file(self.file_path, name).is_file():
-            raise OSError(f"no file {name}")
+        file = untrusted.named_file(self.file_path, name)
+        try:
+            untrusted.existing_file(file)
+        except InputError as error:
+            raise OSError(str(error)) from None  # without its materials a mesh is whole
         return super().get(name)
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from invertwin.errors import InputError
+from invertwin.storage.untrusted import expands
 
 if TYPE_CHECKING:  # a child process starts without what it does not need
     import numpy as np
@@ -169,6 +170,7 @@ def _netcdf(path: str, _variable: str) -> StoredArrays:
     # Where this fails, h5netcdf breaks off half made, and complains when it is thrown away.
     with h5py.File(path) as file:
         file.attrs.get("_nc3_strict")
+        file.visititems(partial(_check_size, path))
     # Nothing is decoded: seconds stay numbers, and every bit stays what it was.
     whole = xarray.load_dataset(path, engine="h5netcdf", decode_cf=False)
     arrays = {
@@ -186,7 +188,15 @@ def _hdf5(path: str, location: str, name: str = "") -> StoredArrays:
     with h5py.File(path, "r") as opened:
         if location not in opened:
             raise KeyError(name)
+        _check_size(path, location, opened[location])
         return StoredArrays({name: StoredArray((), np.asarray(opened[location]), {})}, {})
+
+
+def _check_size(path: str, name: str, held: Any) -> None:
+    """Raise ValueError for many more numbers than a file of HDF5 has bytes."""
+    count = getattr(held, "size", 0) or 0
+    if expands(16 * count, os.stat(path).st_size):  # none takes more than a complex one
+        raise ValueError(f"{count:.3g} numbers in {name} of a small file")
 
 
 def _matlab(path: str, variable: str) -> StoredArrays:

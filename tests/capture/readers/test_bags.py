@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2, as the package rosbags writes them."""
 
 import builtins
+import os
 
 import numpy as np
 import pytest
@@ -179,13 +180,21 @@ def test_what_is_not_there_is_named(bag):
 
 
 def test_no_bag_is_one_line(tmp_path):
-    with pytest.raises(InputError, match="got no file or folder"):
+    with pytest.raises(InputError, match="expected a bag of ROS, got no file"):
         bag_topics(tmp_path / "none.bag")
     broken = tmp_path / "broken.bag"
     broken.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     with pytest.raises(InputError, match="expected a bag of ROS 1 or ROS 2") as caught:
         bag_topics(broken)
     assert "\n" not in str(caught.value)
+
+
+def test_pipes_are_no_bags(tmp_path):
+    (tmp_path / "ros2").mkdir()
+    for pipe, path in ((tmp_path / "a.bag",) * 2, (tmp_path / "ros2/a.db3", tmp_path / "ros2")):
+        os.mkfifo(pipe)
+        with pytest.raises(InputError, match="expected a bag of ROS, got a pipe or a device"):
+            bag_topics(path)
 
 
 def test_messages_of_different_sizes_do_not_stack():

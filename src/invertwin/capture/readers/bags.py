@@ -18,13 +18,14 @@ from torch import Tensor
 from invertwin.capture.track import Track
 from invertwin.checks import check_choice
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import safe_reader
+from invertwin.storage.untrusted import existing_file, safe_reader
 
 # Where messages with poses keep the place, by the names of their fields.
 _POSITION_FIELDS = ("pose.pose.position", "pose.position", "transform.translation")
 _POSITION_FIELDS += ("point", "position")
 # Numbers of `sensor_msgs/PointField`, and what they are to NumPy.
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_ENDINGS = ("db3", "mcap", "yaml", "zstd")  # of the files of a bag of ROS 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +175,9 @@ def _open_bag(path: str | Path) -> Iterator[Any]:
         raise InputError(
             "expected the package rosbags, got none; install it with pip install 'invertwin[ros]'"
         ) from None
-    if not Path(path).exists():
-        raise InputError(f"expected a bag, got no file or folder {path}; check the path")
+    stored = [file for end in _ENDINGS for file in Path(path).glob(f"*.{end}")]
+    for file in stored or [path]:
+        existing_file(file, "a bag of ROS")
     # Bags of ROS 2 need not say what their messages are made of.
     usual = get_typestore(Stores.LATEST)
     with AnyReader([Path(path)], default_typestore=usual) as bag:
