@@ -8,13 +8,15 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Complex, Float64
 from scipy.signal import hilbert
 from torch import Tensor
 
 from invertwin import limits
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.checks import check_fields, check_shape, check_some, checked_number
+from invertwin.checks import check_fields, check_shape, check_some, checked_number, checked_tensor
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
@@ -47,10 +49,13 @@ class ChirpSettings:
         swap_iq: whether Q comes before I in the file.
         bits: resolution of the ADC: 12, 14 or 16 bits.
         lanes: lanes of the LVDS link: 4 (xWR12xx, 14xx) or 2 (later devices); None = not known.
+        channel_factors: calibration of the channels: factors of their beat signals, by the numbers
+            of the elements [tx][rx][real, imaginary]; none = ones.
+        range_bias: how much too long measured ranges are [m].
 
     Raises:
-        InputError: a value out of range, a transmitter that sends twice per loop, or a ramp that
-            ends before its last sample.
+        InputError: a value out of range, a transmitter that sends twice per loop, a ramp that
+            ends before its last sample, or factors of other channels.
     """
 
     start_frequency: limits.Frequency
@@ -69,6 +74,8 @@ class ChirpSettings:
     swap_iq: bool = False
     bits: Annotated[int, limits.AllowedValues((12, 14, 16))] = 16
     lanes: Annotated[int, limits.AllowedValues((2, 4))] | None = None
+    channel_factors: Sequence[Any] = ()
+    range_bias: Annotated[float, Ge(-limits.MAX_LENGTH), Le(limits.MAX_LENGTH)] = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -89,6 +96,24 @@ class ChirpSettings:
                 f"expected a ramp of at least {last:g} s (ADC start and samples), got "
                 f"{self.ramp_end_time:g} s; lower samples or raise the sample rate"
             )
+        if len(self.channel_factors):
+            do = "give (real, imaginary) for every receiver of every transmitter of the device"
+            table = checked_tensor(self.channel_factors, (None, None, 2), "channel factors", do)
+            if len(table) < max(order) or table.shape[1] < max(receivers):
+                raise InputError(
+                    f"expected channel factors of {max(order)} TX and {max(receivers)} RX, got "
+                    f"{tuple(table.shape[:2])}; {do}"
+                )
+
+    @property
+    def correction(self) -> Complex[Tensor, "tx rx #sample"]:
+        """Factors of beat signals that remove the errors of the channels and of range."""
+        tx, rx = torch.tensor(self.transmit_order), torch.tensor(self.receivers)
+        ones = [[[1.0, 0.0]] * max(self.receivers)] * max(self.transmit_order)
+        table = torch.tensor(self.channel_factors or ones, dtype=torch.float64)
+        factors = torch.view_as_complex(table)[tx - 1][:, rx - 1, None]
+        cycles = 2 * self.range_bias / SPEED_OF_LIGHT * self.waveform.frequencies
+        return factors * torch.exp(-2j * torch.pi * cycles)
 
     @property
     def waveform(self) -> FMCW:
@@ -160,17 +185,19 @@ class ChirpData:
 
     @property
     def beat(self) -> Complex[Tensor, "frame chirp tx rx sample"]:
-        """Complex beat signals: the samples or, of real ones, their analytic signal.
+        """Complex beat signals: the samples or, of real ones, their analytic signal, corrected.
 
         An analytic signal holds for ranges below half of the waveform's `max_range`.
         """
-        if not self.settings.real:
-            return self.samples
-        # Of every sample 8 bytes as a double, and 16 each of spectrum, halved spectrum, result.
-        need, do = 56.0 * self.samples.numel(), "give fewer frames"
-        require_memory(need, "the analytic signal of real samples", do)
-        analytic = np.asarray(hilbert(self.samples.real.numpy().astype(np.float64), axis=-1))
-        return torch.from_numpy(analytic)
+        found = self.samples
+        if self.settings.real:
+            # Of each sample 8 bytes as a double, and 16 each of spectrum, halved spectrum, result.
+            need, do = 56.0 * found.numel(), "give fewer frames"
+            require_memory(need, "the analytic signal of real samples", do)
+            found = torch.from_numpy(hilbert(found.real.numpy().astype(np.float64), axis=-1))
+        if self.settings.channel_factors or self.settings.range_bias:
+            found = (found * self.settings.correction).to(found.dtype)
+        return found
 
     def to_chirp_capture(
         self,

@@ -9,14 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from invertwin.errors import InputError
+from invertwin.inversion.confidence import verdict as verdicts
 from invertwin.inversion.confidence.realisations import FitResult
 from invertwin.inversion.confidence.uncertainty import CovarianceEstimator, Uncertainty
-from invertwin.inversion.confidence.verdict import (
-    MIN_EXPLAINED_FRACTION,
-    Verdict,
-    explained_fractions,
-    judge_fit,
-)
 from invertwin.inversion.fit import Callback, Fit, FitSettings, Status
 from invertwin.inversion.observation import Observation, Unknown, Unknowns, name_unknowns
 from invertwin.inversion.optimizer import Optimizer
@@ -61,7 +56,7 @@ class Reconstruction:
 
         A fitted gain of zero has no gradient, so such a fit stays at its start.
         """
-        return min(explained_fractions(self.result)) < MIN_EXPLAINED_FRACTION
+        return min(verdicts.explained_fractions(self.result)) < verdicts.MIN_EXPLAINED_FRACTION
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -73,9 +68,9 @@ class Reconstruction:
         return CovarianceEstimator(self.result, size_errors=True).error_bars()
 
     @cached_property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> verdicts.Verdict:
         """Goodness of fit and ambiguities, computed at first access."""
-        found = judge_fit(self.result)
+        found = verdicts.judge_fit(self.result)
         if not self.doubts:
             return found
         word = "ambiguous" if found.is_consistent else found.word

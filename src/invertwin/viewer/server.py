@@ -280,9 +280,8 @@ class Viewer:
         how: dict[str, Any] = {"visible": visible}
         if layer.kind == "surface":
             how |= {"color": layer.color, "opacity": None if layer.opacity == 1 else layer.opacity}
-            how |= {"cast_shadow": False, "receive_shadow": False}
+            how |= {"cast_shadow": False, "receive_shadow": False, "flat_shading": True}
             faces = self._walls.get(layer.name, layer.faces)
-            how |= {"flat_shading": True}
             side = "front" if layer.name in self._walls else "double"
             made = scene.add_mesh_simple(node, layer.points, faces, side=side, **how)
             if layer.group == "twin":

@@ -1,29 +1,41 @@
 """Settings files (`.cfg`) of the mmWave SDK and its demos: one command per line."""
 
+import warnings
+from itertools import product
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti import chirp_table
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import read_text, safe_reader
 
-# Fewest arguments of the commands that are read.
+# What commands mean to samples: fewest arguments, required values, and what is ignored on purpose.
 _ARGUMENTS = chirp_table.FIELDS["arguments"]
+_IGNORED = {name for names in chirp_table.FIELDS["ignored"].values() for name in names}
 _UNIQUE_COMMANDS = ("channelCfg", "adcCfg", "frameCfg")
 _BAND_EDGE = 70e9  # Hz, between the devices of 60 and 77 GHz
 # Places of the numbers of a profile in its command.
 _PROFILE = (1, 2, 3, 4, 7, 9, 10)
+_ONES = ["1", "0"] * 4  # factors of a device's receivers
+# Place, shift in the byte of a transmitter, and name of what a profile may do to each.
+_TRANSMIT = ((5, 0, "power back-off [dB]"), (6, 2, "phase [5.625°]"))
 
 
 @safe_reader("settings of the mmWave SDK", "compare with the SDK's user guide")
 def read_cfg(path: str | Path) -> ChirpSettings:
-    """Read `channelCfg`, `adcCfg`, `profileCfg`, `chirpCfg` and `frameCfg` of a `.cfg` file.
+    """Read the settings of a `.cfg` file of the SDK 1 to 3 or the MCU+ SDK.
 
-    `adcbufCfg` tells the order of I and Q, if the file has it. A comment such as
-    ``% Platform:xWR18xx`` names the device, which tells the number of lanes. All other commands
-    set up what the demo computes; they are ignored. In MCU+ SDK files (AWR2944), `frameCfg` repeats
-    the number of samples before the period.
+    `compRangeBiasAndRxChanPhase` and `antPhaseRot` become a calibration of the channels. A comment
+    such as ``% Platform:xWR18xx`` names the device, which tells the number of lanes. In MCU+ SDK
+    files (AWR2944), `frameCfg` repeats the number of samples before the period. Commands that only
+    set up what the demo computes are ignored (`fields.toml` lists them).
+
+    Warns (`PhysicsWarning`) of commands that are not known, and of transmitters that differ in
+    power or phase.
 
     Raises:
         InputError: no file, a command that is missing or cannot be understood, or one that asks for
@@ -33,23 +45,17 @@ def read_cfg(path: str | Path) -> ChirpSettings:
     path = Path(path)
     lines = read_text(path, "a .cfg file of the mmWave SDK").splitlines()
     found: dict[str, list[list[str]]] = {}
-    platform = ""
-    for line in lines:
-        stripped = line.strip()
-        if stripped.startswith("%"):
-            if "platform" in stripped.lower():
-                platform = stripped.partition(":")[2]
-            continue
-        if stripped:
-            command, *arguments = stripped.split("%")[0].split()
-            found.setdefault(command, []).append(arguments)
-    if "advFrameCfg" in found or "subFrameCfg" in found:
-        raise InputError(
-            f"expected one kind of frame (frameCfg) in {path.name}, got advFrameCfg; "
-            "sub-frames are not supported"
-        )
+    platform, unknown = "", []
     try:
-        return _parse_settings(found, chirp_table.device_lanes(platform))
+        for number, line in enumerate(lines, 1):
+            if line.lstrip().startswith("%"):
+                platform = line.partition(":")[2] if "platform" in line.lower() else platform
+            elif words := line.split("%")[0].split():
+                _check_command(number, *words)
+                found.setdefault(words[0], []).append(words[1:])
+                if words[0] not in _ARGUMENTS and words[0] not in _IGNORED:
+                    unknown.append(f"{words[0]} (line {number})")
+        read = _parse_settings(found, chirp_table.device_lanes(platform))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     except (ValueError, ArithmeticError) as error:
@@ -57,6 +63,51 @@ def read_cfg(path: str | Path) -> ChirpSettings:
             f"expected numbers as arguments in {path.name}, got others ({error}); "
             "compare with the SDK's user guide"
         ) from error
+    messages = _compare_transmitters(found["profileCfg"], read.transmit_order)
+    if unknown:
+        messages.append(f"ignored {', '.join(unknown)}, not known here: they may change samples")
+    for message in messages:
+        warnings.warn(f"{path.name}: {message}", PhysicsWarning, stacklevel=2)
+    return read
+
+
+def _check_command(number: int, command: str, *arguments: str) -> None:
+    """Refuse a line whose samples would mean something that is not supported."""
+    line = f"line {number} ({' '.join((command, *arguments))[:60]})"
+    if len(arguments) < (count := _ARGUMENTS.get(command, 0)):
+        raise InputError(
+            f"expected at least {count} arguments of {command}, got {len(arguments)} in {line}; "
+            "the line is incomplete"
+        )
+    for rule in chirp_table.FIELDS["required"]:
+        given = arguments[rule["place"] :][:1] if rule["command"] == command else ()
+        if given and given[0] not in rule["values"]:
+            raise InputError(
+                f"expected {' or '.join(rule['values'])}, got {given[0]} in {line}; {rule['why']}"
+            )
+
+
+def _compare_transmitters(profiles: list[list[str]], order: tuple[int, ...]) -> list[str]:
+    """Describe how the transmitters in use differ in power and phase."""
+    found = []
+    for profile, (place, shift, what) in product(profiles, _TRANSMIT):
+        code = int(float(profile[place]))
+        each = {f"TX{tx}": code >> 8 * (tx - 1) + shift & 0xFF >> shift for tx in order}
+        if len(set(each.values())) > 1:
+            found.append(
+                f"profileCfg {profile[0]} sends with different {what} {each}: directions are wrong "
+                "until invertwin look --reflector has calibrated the channels"
+            )
+    return found
+
+
+def _read_calibration(found: dict[str, list[list[str]]]) -> dict[str, Any]:
+    """Calibration of the channels: `compRangeBiasAndRxChanPhase` times `antPhaseRot`."""
+    bias, *numbers = found.get("compRangeBiasAndRxChanPhase", [["0", *_ONES]])[-1]
+    signs = found.get("antPhaseRot", [["1"] * 4])[-1]
+    factors = np.array(numbers, float).reshape(-1, 4, 2) * np.array(signs, float).reshape(-1, 4, 1)
+    applied = bool((factors != (1, 0)).any())
+    return {"range_bias": float(bias), "channel_factors": factors.tolist() if applied else ()}
 
 
 def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSettings:
@@ -65,13 +116,6 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
             raise InputError(
                 f"expected a line {command}, got none; the settings are incomplete, or no .cfg file"
             )
-    for command, count in _ARGUMENTS.items():
-        for arguments in found.get(command, []):
-            if len(arguments) < count:
-                raise InputError(
-                    f"expected at least {count} arguments of {command}, got {len(arguments)}; "
-                    "the line is incomplete"
-                )
     channel, adc, frame = (found[command][-1] for command in _UNIQUE_COMMANDS)
     chirps = [
         (int(first), int(last), int(profile), int(tx, 0), any(map(float, variations)))
@@ -79,16 +123,14 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
     ]
     # MCU+ SDK: first, last, loops, frames, samples, period, trigger, delay.
     samples = int(frame.pop(4)) if len(frame) >= 8 else None
-    for arguments in found.get("lvdsStreamCfg", []):
-        if int(arguments[1]):
-            raise InputError(
-                "expected a stream of samples only, got headers (lvdsStreamCfg); record without"
-            )
     bits, kind = int(adc[0]), int(adc[1])
-    if bits not in chirp_table.BITS or kind not in (0, 1, 2):
+    # Since SDK 2 a sub-frame number comes first: format, order of I and Q, and of the receivers.
+    buffer = found.get("adcbufCfg", [[]])[-1]
+    real, swap, blocks = (int(n) for n in buffer[-4:-1]) if buffer else (kind == 0, 0, lanes != 4)
+    if bool(real) != (kind == 0) or (lanes and bool(blocks) != (lanes == 2)):
         raise InputError(
-            f"expected adcCfg with bits 0 to 2 and format 0 to 2, got {bits} and {kind}; "
-            "see the SDK's user guide"
+            f"expected adcbufCfg with format {int(kind == 0)} as adcCfg says, and interleaving "
+            f"{int(lanes != 4)} as the device does, got {real} and {blocks}; one of them is wrong"
         )
     read = chirp_table.frame_settings(
         {int(profile[0]): profile for profile in found["profileCfg"]},
@@ -97,10 +139,10 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
         frame,
         receivers=chirp_table.bits_to_numbers(int(channel[0], 0)),
         real=kind == 0,
-        # SampleSwap: 1 = Q in the lower half word. Since SDK 2 a sub-frame number comes first.
-        swap_iq="adcbufCfg" in found and bool(int(found["adcbufCfg"][-1][-3])),
+        swap_iq=bool(swap),  # 1 = Q in the lower half word
         bits=chirp_table.BITS[bits],
         lanes=lanes,
+        **_read_calibration(found),
     )
     unused = set(read.transmit_order) - set(chirp_table.bits_to_numbers(int(channel[1], 0)))
     if unused:
@@ -130,6 +172,8 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
     devices = {2: "xWR68xx" if s.start_frequency < _BAND_EDGE else "xWR18xx", 4: "xWR1443"}
     start, idle, adc, end, slope, samples, rate = chirp_table.profile_texts(s)
     receivers = chirp_table.numbers_to_bits(s.receivers)
+    factors = s.channel_factors or [_ONES] * max(3, *s.transmit_order)
+    calibration = [s.range_bias, *np.ravel(factors).astype(float)]
     lines = [
         *([f"% Platform:{devices[s.lanes]}"] if s.lanes else []),
         "sensorStop",
@@ -137,7 +181,7 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         "dfeDataOutputMode 1",
         f"channelCfg {receivers} {chirp_table.numbers_to_bits(s.transmit_order)} 0",
         f"adcCfg {chirp_table.BIT_CODES[s.bits]} {int(not s.real)}",
-        f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} 1 1",
+        f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} {int(s.lanes != 4)} 1",
         f"profileCfg 0 {start} {idle} {adc} {end} 0 0 {slope} 0 {samples} {rate} 0 0 30",
         *(
             f"chirpCfg {i} {i} 0 0 0 0 0 {chirp_table.numbers_to_bits([tx])}"
@@ -146,6 +190,7 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
         f"frameCfg 0 {len(s.transmit_order) - 1} {s.loops} {s.frames or 0} "
         f"{chirp_table.format_decimal(s.frame_period or 0, 3)} 1 0",
         "lvdsStreamCfg -1 0 1 0",
+        f"compRangeBiasAndRxChanPhase {' '.join(map(chirp_table.format_decimal, calibration))}",
         "sensorStart",
     ]
     with replace_file(path) as part:

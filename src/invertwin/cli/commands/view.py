@@ -29,13 +29,7 @@ _TIMES, _TIME_STEP = 48, 0.05  # steps in time of what moves, and their distance
 
 
 def run_view(
-    target: Path,
-    console: Console,
-    *,
-    host: str,
-    port: int,
-    token: str | None,
-    record: Path | None,
+    target: Path, console: Console, *, host: str, port: int, token: str | None, record: Path | None
 ) -> None:
     """Show a target until Ctrl-C, or write a page of it.
 

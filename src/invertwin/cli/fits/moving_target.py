@@ -14,6 +14,7 @@ from torch import Tensor
 from invertwin import discovery, plotting
 from invertwin.capture import ChirpCapture
 from invertwin.channel import Sampling
+from invertwin.cli import report
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats
 from invertwin.cli.fits.problem import (
@@ -28,13 +29,6 @@ from invertwin.cli.fits.problem import (
     require_sections,
 )
 from invertwin.cli.fits.scores import error_bar_table
-from invertwin.cli.report import (
-    ReportPicture,
-    ReportTable,
-    load_texts,
-    quantity_table,
-    save_picture,
-)
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import scene_at_start
@@ -163,7 +157,8 @@ class MovingTarget(DataKind):
         outcome = (
             f"The strongest mover is {metrics['mover_range_m']:.2f} m away; its twin correlates "
             f"{metrics['twin_correlation']:.3f} with the recording, a point target "
-            f"{metrics['bare_psf_correlation']:.3f}. {load_texts('verdicts')[metrics['verdict']]}"
+            f"{metrics['bare_psf_correlation']:.3f}. "
+            f"{report.load_texts('verdicts')[metrics['verdict']]}"
         )
         return Summary(outcome, result, _pictures(fits, folder), tables)
 
@@ -243,7 +238,7 @@ def _correlations(
     return {**headline, f"{prefix}correlations": rows}
 
 
-def _pictures(fits: Fits, folder: RunFolder) -> list[ReportPicture]:
+def _pictures(fits: Fits, folder: RunFolder) -> list[report.ReportPicture]:
     problem, (whole, _) = fits.problem, _make_twins(fits)
     scene, recording = problem.scene, whole.recording
     radar = recording.radar()
@@ -278,20 +273,20 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[ReportPicture]:
         "scene": (where, "Where it is", "mover_scene"),
         "loss": (plotting.convergence(losses), "1 − correlation of the magnitudes", ""),
     }
-    return [save_picture(folder, name, *shown) for name, shown in drawn.items()]
+    return [report.save_picture(folder, name, *shown) for name, shown in drawn.items()]
 
 
-def _tables(metrics: Mapping[str, Any]) -> list[ReportTable]:
+def _tables(metrics: Mapping[str, Any]) -> list[report.ReportTable]:
     columns = list(product(("", "heldout_"), ("twin", "bare_psf")))
     scales: list[Sequence[Any]] = [
         [label, *(metrics[f"{part}correlations"][scale][name] for part, name in columns)]
         for scale, label in _SCALES.items()
     ]
     heads = ["map", "twin", "point", "twin, second half", "point, second half"]
-    note = load_texts("notes")["mover_correlation"]
+    note = report.load_texts("notes")["mover_correlation"]
     return [
-        quantity_table("Result", metrics, skip=("loss",)),
-        ReportTable("Correlation with the recording", heads, scales, note),
-        quantity_table("The twin", metrics["twin"], label_table="mover"),
+        report.quantity_table("Result", metrics, skip=("loss",)),
+        report.ReportTable("Correlation with the recording", heads, scales, note),
+        report.quantity_table("The twin", metrics["twin"], label_table="mover"),
         error_bar_table(dict(metrics)),
     ]

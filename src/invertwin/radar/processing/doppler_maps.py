@@ -11,14 +11,9 @@ from scipy.special import gammainccinv
 from torch import Tensor
 
 from invertwin.channel import Grid
+from invertwin.radar.processing import doppler
 from invertwin.radar.processing.beamforming import beamform
 from invertwin.radar.processing.direction import capon, music
-from invertwin.radar.processing.doppler import (
-    compensate_tdm,
-    interpolate_rates,
-    range_doppler,
-    velocity_axis,
-)
 from invertwin.radar.processing.reflectors import noise_power
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
@@ -114,17 +109,17 @@ def doppler_maps(
         InputError: As ``range_doppler`` and ``beamform``.
     """
     radar, signal = radar.frames([frame]), beat[frame : frame + 1]
-    cube = range_doppler(signal, radar, grid, chirps)
+    cube = doppler.range_doppler(signal, radar, grid, chirps)
     flat = cube.abs().square().mean((2, 3))[0]
     anywhere = torch.ones_like(flat) > 0
     everything, strongest = _sum_range_rates(cube, flat, radar, grid, chirps, anywhere)
-    moving = range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
+    moving = doppler.range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
     power = moving.abs().square().mean((2, 3))[0]
     cells = _detect_moving_cells(power, flat, len(radar.virtual_positions))
     movers, mover = None, None
     if bool(cells.any()):
         movers, mover = _sum_range_rates(moving, power, radar, grid, chirps, cells)
-    velocities = velocity_axis(radar, chirps)
+    velocities = doppler.velocity_axis(radar, chirps)
     return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
 
 
@@ -146,8 +141,8 @@ def _sum_range_rates(
         chirps: chirp timing.
         candidates: cells of which the strongest is returned.
     """
-    cube = compensate_tdm(cube, radar, chirps, interpolate_rates(level))[0]
-    velocities = velocity_axis(radar, chirps)
+    cube = doppler.compensate_tdm(cube, radar, chirps, doppler.interpolate_rates(level))[0]
+    velocities = doppler.velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
     total = torch.zeros(grid.shape, dtype=torch.float64)
     seen = (grid.u[:, None].square() + grid.v.square()) <= 1
@@ -216,9 +211,9 @@ def doppler_snapshots(
         frame: index of the frame.
     """
     radar = radar.frames([frame])
-    cube = range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
-    rates = interpolate_rates(cube.abs().square().mean((2, 3))[0])
-    return compensate_tdm(cube, radar, chirps, rates)[0]
+    cube = doppler.range_doppler(beat[frame : frame + 1], radar, grid, chirps, window="rectangular")
+    rates = doppler.interpolate_rates(cube.abs().square().mean((2, 3))[0])
+    return doppler.compensate_tdm(cube, radar, chirps, rates)[0]
 
 
 def find_peak(spectrum: Float[Tensor, "range u v"], grid: Grid, velocity: float = 0.0) -> Peak:
