@@ -19,7 +19,7 @@ MINUTES ?= 30
 LOWEST := .venv-lowest
 WHEEL := .venv-wheel
 
-.PHONY: help demo test test-fast test-all test-docs test-gpu test-browser fuzz lowest wheel docs check format bench clean
+.PHONY: help demo test test-fast test-all test-docs test-gpu test-browser fuzz lowest wheel docs pictures check format bench clean
 
 help:
 	@echo 'make demo       find a hidden letter from its radar echoes (under 5 minutes)'
@@ -33,6 +33,7 @@ help:
 	@echo 'make lowest     the quick tests with the lowest versions that we allow'
 	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
 	@echo 'make docs       the site in out/docs/html: runs all tutorials, checks all links'
+	@echo 'make pictures   first pictures of README.md and the site, in docs/pictures'
 	@echo 'make check      format, lint, types, import arrows'
 	@echo 'make format     let ruff format and sort'
 	@echo 'make bench      speed and memory, ours and peers'"'"
@@ -93,6 +94,13 @@ docs: .venv/.docs .venv/.llvm
 	$(BIN)/python docs/check_site.py out/docs/html
 	$(BIN)/python docs/public_names.py docs/api/*.md
 	@echo 'the site: out/docs/html/index.html'
+
+pictures: .venv/.run .venv/.llvm .venv/.browser
+	$(BIN)/invertwin demo --overwrite
+	$(BIN)/python benchmarks/animation.py out/demo
+	$(BIN)/python benchmarks/screenshot.py out/demo
+	$(BIN)/python examples/03_gradient.py docs/pictures
+	$(BIN)/python examples/06_coverage.py docs/pictures
 
 check: .venv/.dev
 	$(BIN)/ruff format --check .

@@ -1,6 +1,7 @@
 """The public menu and the project's own files agree with each other."""
 
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -63,6 +64,22 @@ def test_python_in_the_makefile_names_functions_that_exist(repository):
         functions = re.findall(rf"\b{module}\.(\w+)", code)
         assert functions
         assert [name for name in functions if not hasattr(imported, name)] == []
+
+
+def test_the_container_runs_what_the_makefile_has(repository):
+    folder = repository / ".devcontainer"
+    settings = json.loads((folder / "devcontainer.json").read_text())
+    dockerfile = folder / settings["build"]["dockerfile"]
+    assert (folder / settings["build"]["context"]).samefile(repository)
+    assert dockerfile.samefile(repository / "Dockerfile")
+    text, makefile = dockerfile.read_text(), (repository / "Makefile").read_text()
+    assert f" AS {settings['build']['target']}\n" in text
+    assert settings["postCreateCommand"] == "make demo"
+    run = [line for line in text.splitlines() if line.startswith(("RUN make", "CMD"))]
+    targets = set(re.findall(r"[.\w/]+", " ".join(run))) - {"RUN", "CMD", "make"}
+    assert targets == {".venv/.run", ".venv/.llvm", "demo"}
+    assert all(re.search(rf"^{re.escape(name)}:", makefile, re.MULTILINE) for name in targets)
+    assert {"libllvm19", "libatomic1", "make"} <= set(text.split())
 
 
 def test_every_dependency_has_its_licence_in_the_notice(project, repository):
