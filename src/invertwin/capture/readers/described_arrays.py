@@ -183,7 +183,7 @@ def write_chirps(
     description: dict[str, Any] = {
         "frame": FRAME,
         "data": {"file": file, **named, "dimensions": CHIRP_DIMS},
-        "settings": {name: value for name, value in settings.items() if value is not None},
+        "settings": {name: value for name, value in settings.items() if value not in (None, ())},
     }
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
