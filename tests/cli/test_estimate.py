@@ -144,8 +144,8 @@ def test_check_says_memory_and_time_and_leaves_nothing(run_file, monkeypatch, ca
 
 @pytest.mark.filterwarnings("default::invertwin.errors.PhysicsWarning")
 def test_check_names_what_is_wrong_with_a_mesh(run_file, monkeypatch, capsys):
-    """Two halves of a plate, a hundredth of a millimetre apart."""
-    half, aside = shapes.plate(0.2, 0.3), torch.tensor([0.0, 0.20001, 0.0]).double()
+    """Two halves of a plate, a fifth of a millimetre apart."""
+    half, aside = shapes.plate(0.2, 0.3), torch.tensor([0.0, 0.2002, 0.0]).double()
     cracked = concatenate_meshes([half, Mesh(half.vertices + aside, half.faces)])
     save_mesh(run_file.with_name("cracked.ply"), cracked)
     drawn = 'shape = "plate"\nwidth = 0.4\nheight = 0.3\ndivisions = 3\n'
@@ -154,8 +154,8 @@ def test_check_names_what_is_wrong_with_a_mesh(run_file, monkeypatch, capsys):
     said, warned = capsys.readouterr()
     rows = [line.split("│")[1:-1] for line in said.splitlines() if "│" in line]
     defects = {row[0].strip(): row[-1].strip() for row in rows if len(row) == 6}
-    assert defects == {"plate": "2 edges along cracks 1e-05 m wide", "wall": "none"}
-    assert "the mesh has 2 edges along cracks 1e-05 m wide" in warned
+    assert defects == {"plate": "2 edges along cracks 0.0002 m wide", "wall": "none"}
+    assert "the mesh has 2 edges along cracks 0.0002 m wide" in warned
 
 
 def test_points_of_every_object_are_counted(run_file, monkeypatch, capsys):

@@ -68,8 +68,8 @@ class Mesh:
     def summary(self) -> "MeshSummary":
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
-        welded, places = mesh_topology.weld_faces(points, strip_derivatives(self.faces).numpy())
-        counts = mesh_topology.find_edges(welded, places).counts
+        faces = strip_derivatives(self.faces).numpy()
+        counts = mesh_topology.close_cracks(points, faces)[2].counts
         x, y, z = np.ptp(points, axis=0).tolist()
         edges = int((counts == 1).sum()), int((counts > 2).sum())
         return MeshSummary((x, y, z), len(self.faces), *edges)

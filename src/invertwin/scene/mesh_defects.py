@@ -18,7 +18,6 @@ from invertwin.scene.mesh import Mesh
 from invertwin.scene.mesh_union import unite_parts
 from invertwin.scene.scene import Scene
 
-_WIDEST_CRACK = 1e-4  # of the size of the mesh
 _LEAST_SHARE = 1e-6  # of the smaller triangle, in common with another one
 
 
@@ -27,7 +26,7 @@ class MeshDefects(NamedTuple):
 
     Attributes:
         doubled_triangles: number of triangles that repeat others, or lie on those of other parts.
-        cracked_edges: number of open edges that run beside others, up to 10⁻⁴ of the diagonal off.
+        cracked_edges: number of open edges along cracks of 10⁻⁴ to 10⁻³ of the diagonal.
         crack_width: greatest distance of these from the others [m].
         has_overlapping_parts: True if closed parts overlap or touch; `merge_meshes` unites them.
     """
@@ -60,12 +59,12 @@ def find_defects(mesh: Mesh) -> MeshDefects:
     """
     if mesh not in _found:
         plain = Mesh(*map(strip_derivatives, (mesh.vertices, mesh.faces)))
-        welded, places = mesh_topology.weld_faces(plain.vertices.numpy(), plain.faces.numpy())
-        count, width = measure_cracks(mesh_topology.find_edges(welded, places), places)
+        points = plain.vertices.numpy()
+        welded, places, _, cracks = mesh_topology.close_cracks(points, plain.faces.numpy())
         _found[mesh] = MeshDefects(
             int(find_doubled_faces(welded, places).sum()),
-            count,
-            width * float(np.linalg.norm(np.ptp(plain.vertices.numpy(), axis=0))),
+            cracks.open_edges,
+            cracks.width * float(np.linalg.norm(np.ptp(points, axis=0))),
             unite_parts(plain) is not plain,
         )
     return _found[mesh]
@@ -153,25 +152,3 @@ def _overlap_in_plane(
     least = np.minimum(shapely.area(shapes[0]), shapely.area(shapes[1]))
     found[found] = shapely.area(shapely.intersection(*shapes)) > _LEAST_SHARE * least
     return found
-
-
-def measure_cracks(
-    edges: mesh_topology.MeshEdges, places: mesh_topology.Points
-) -> tuple[int, float]:
-    """Count open edges that run beside others, beyond the tolerance within which both join.
-
-    Args:
-        edges: edges of the mesh.
-        places: positions in units of the size of the mesh.
-
-    Returns:
-        Their number, and the greatest distance from another one, in these units.
-    """
-    ends = edges.ends[edges.counts == 1]
-    middle = len(places) + np.arange(len(ends))
-    points = np.concatenate([places, places[ends].mean(1)])
-    row, vertex, share = mesh_topology.find_vertices_on_edges(ends, middle, points, _WIDEST_CRACK)
-    start, end = np.moveaxis(places[ends[row]], 1, 0)
-    width = np.linalg.norm(points[vertex] - start - share[:, None] * (end - start), axis=1)
-    other = row != vertex - len(places)
-    return len(np.unique(vertex[other])), float(width[other].max(initial=0.0))

@@ -1,6 +1,7 @@
 """Meshes as files and programs have them: repeated corners, T-junctions, slivers, panels."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from invertwin.scene import (
 )
 from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.mesh_topology import (
+    CRACK_TOLERANCE,
     WELD_TOLERANCE,
     find_vertices_on_edges,
     separate_groups,
@@ -75,10 +77,75 @@ def test_a_soup_of_single_precision_is_the_mesh(shift):
 def test_a_crack_wider_than_the_tolerance_stays_open():
     one, other = plates_of_a_box()[:2]
     size = float((merge_meshes([one, other]).summary().extent[0]) * math.sqrt(3))
-    for width, closed in ((0.3 * WELD_TOLERANCE * size, True), (3 * WELD_TOLERANCE * size, False)):
-        parts = plates_of_a_box()
-        parts[0] = Mesh(parts[0].vertices - width * float64(1, 0, 0), parts[0].faces)
-        assert (1 not in table(merge_meshes(parts))) == closed
+    for share in (0.3, 3.0):
+        for tolerance, closed in ((WELD_TOLERANCE, True), (CRACK_TOLERANCE, share < 1)):
+            parts = plates_of_a_box()
+            aside = share * tolerance * size * float64(1, 0, 0)
+            parts[0] = Mesh(parts[0].vertices - aside, parts[0].faces)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                shape = topology_of([merge_meshes(parts)])
+            assert (shape.open_objects == set()) == closed
+            named = [str(found.message) for found in caught]
+            assert [text.startswith("8 edges of meshes") for text in named] == [True] * (not closed)
+
+
+def jittered(mesh, width, seed):
+    """Three vertices for each triangle, off by half a width."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    generator = torch.Generator().manual_seed(seed)
+    off = torch.randn(corners.shape, generator=generator, dtype=torch.float64)
+    corners = corners + 0.5 * width * torch.nn.functional.normalize(off, dim=1)
+    return Mesh(corners, torch.arange(len(corners)).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("share", [1e-7, 2e-6, 1e-5, 9e-5])
+def test_cracks_are_closed_by_moving_their_vertices(share):
+    clean = box((0.3, 0.4, 0.5))
+    cracked = jittered(clean, share * math.sqrt(0.5), 0)
+    shape = topology_of([cracked])
+    assert len(shape.edges) == 18
+    assert not shape.open_objects
+    points = shape.join_vertices([cracked.vertices])
+    corners = points[shape.faces]
+    places = corners.reshape(-1, 3).unique(dim=0)
+    assert len(places) == 8 or share == 1e-7  # below the offset of rays they stay
+    distance = torch.cdist(clean.vertices, places).amin(0)
+    assert float(distance.max()) <= 0.51 * share * math.sqrt(0.5)
+    volume = float((corners[:, 0] * torch.linalg.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+    assert volume == pytest.approx(0.06, rel=6 * share)
+
+
+def test_derivatives_flow_to_the_vertices_onto_which_others_move():
+    cracked = jittered(box(0.4), 1e-5, 1)
+    vertices = cracked.vertices.clone().requires_grad_()
+    topology_of([cracked]).join_vertices([vertices]).sum().backward()
+    assert vertices.grad is not None
+    assert float(vertices.grad.sum()) == pytest.approx(3 * 36)
+    assert int((vertices.grad[:, 0] > 0).sum()) == 8
+
+
+def test_a_crack_beside_a_t_junction_is_closed():
+    """The lower triangles end 2e-5 of the size below the long side of the upper one."""
+    low = -4e-5
+    vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [0.5, low, 0], [1, -1, 0])
+    points = torch.cat([vertices, float64([0, low, 0], [2, low, 0])])
+    mesh = Mesh(points, torch.tensor([[0, 1, 2], [5, 4, 3], [3, 4, 6]]))
+    shape = topology_of([mesh])
+    assert ((shape.edge_faces >= 0).sum(1) == 2).sum() == 3
+    moved = shape.join_vertices([mesh.vertices])
+    assert moved[3].tolist() == pytest.approx([0.5, 0.0, 0.0], abs=1e-12)
+    assert moved[:3].equal(points[:3])
+
+
+def test_thin_bodies_and_sheets_side_by_side_stay_as_they_are():
+    thin = box((1.0, 0.8, 2e-5))
+    assert dict(table(thin)) == {2: 18}
+    sheet = plate(1.0, 0.8)
+    pair = concatenate_meshes([sheet, Mesh(sheet.vertices + float64(2e-5, 0, 0), sheet.faces)])
+    for mesh in (thin, pair):
+        assert topology_of([mesh]).join_vertices([mesh.vertices]).equal(mesh.vertices)
+    assert table(pair)[1] == 2 * table(sheet)[1]
 
 
 def test_an_edge_ends_where_vertices_lie_on_it():

@@ -103,7 +103,8 @@ def visible_fractions(
     require_surfaces(scene)
     items = list(scene.objects.values())
     parts = [item.vertices for item in items]
-    topology, vertices = topology_of([item.mesh for item in items], parts), torch.cat(parts)
+    topology = topology_of([item.mesh for item in items], parts)
+    vertices = topology.join_vertices(parts)
     fixed, origins = strip_derivatives(vertices), strip_derivatives(observers)
     center, axes, offsets = map(strip_derivatives, (cells.center, cells.axes, cells.offsets))
     panel = PanelCells(center, axes, offsets, cells.size)

@@ -17,14 +17,10 @@ from invertwin.channel.em import antenna_fields as antennas
 from invertwin.channel.em.depolarisation import random_scattering_matrix
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.paths import Link, Paths, concatenate_paths
+from invertwin.channel.rays import scene_tables
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import RayScene, face_areas
-from invertwin.channel.rays.scene_tables import (
-    flatten,
-    is_visibility_differentiated,
-    require_silhouette_samples,
-)
 from invertwin.channel.sampling import Sampling
 from invertwin.errors import InputError
 from invertwin.runtime.progress import track
@@ -61,8 +57,8 @@ def trace_field(
     """
     depth = sampling.depth
     with tracing(sampling.backend):
-        geometry = flatten(scene, link.wavelength, motion="fixed")
-        moves = sampling.boundary and is_visibility_differentiated(geometry, link)
+        geometry = scene_tables.flatten(scene, link.wavelength, motion="fixed")
+        moves = sampling.boundary and scene_tables.is_visibility_differentiated(geometry, link)
         require_single_surfaces(scene, allows_overlaps=True)
         rays = RayScene(geometry, link)
         viewers = torch.cat([link.tx, link.rx])
@@ -70,7 +66,7 @@ def trace_field(
         parts: list[Paths] = []
         if any(geometry.coherent):
             if sampling.boundary:
-                require_silhouette_samples(geometry, link, sampling.boundary_samples)
+                scene_tables.require_silhouette_samples(geometry, link, sampling.boundary_samples)
             if moves and geometry.has_sheets:
                 raise InputError(
                     "expected no sheets where a derivative of coherent fields moves silhouettes, "

@@ -22,16 +22,11 @@ from invertwin.channel.power.transmission import (
     trace_to_surface,
     trace_transmission,
 )
+from invertwin.channel.rays import surface_point
 from invertwin.channel.rays.arrays import gather_points, scramble_seed
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import PLANE_TOLERANCE
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
-from invertwin.channel.rays.surface_point import (
-    SurfacePoint,
-    barycentric_coordinates,
-    face_normal,
-    interpolate_position,
-)
 
 # Least cosine between a boundary ray and the normal of the shadowed surface.
 _MIN_GRAZING_COSINE = 1e-5
@@ -83,7 +78,7 @@ class SilhouetteSample:
     transmission: SegmentTransmission
     open: SegmentTransmission
     covered: SegmentTransmission
-    source: SurfacePoint | None = None
+    source: surface_point.SurfacePoint | None = None
 
     @property
     def size(self) -> int:
@@ -412,13 +407,13 @@ def is_not_grazing(
         direction: direction of each ray [lane, 3].
         active: mask of valid rays.
     """
-    normal = face_normal(rays.corners(face, active))
+    normal = surface_point.face_normal(rays.corners(face, active))
     return active & (dr.abs(dr.dot(normal, direction)) > _MIN_GRAZING_COSINE * dr.norm(direction))
 
 
 def shadow_speed(
     inputs: Inputs, samples: SilhouetteSample, source: mit.Point3f
-) -> tuple[SurfacePoint, mit.Float]:
+) -> tuple[surface_point.SurfacePoint, mit.Float]:
     """Compute the velocity of the shadow boundary that edges cast from attached positions.
 
     ``T · (x_c − x_m)``: x_c is the point at which the attached ray meets the attached plane behind
@@ -444,9 +439,9 @@ def shadow_speed(
     moving = c + (y - c) * (dr.dot(plane, p0 - c) / dr.dot(plane, y - c))
 
     detached = integrand.corners(fixed, samples.face)
-    shadow, normal = dr.detach(moving), face_normal(detached)
-    b1, b2 = barycentric_coordinates(shadow, detached)
-    material = interpolate_position(triangle, b1, b2)
+    shadow, normal = dr.detach(moving), surface_point.face_normal(detached)
+    b1, b2 = surface_point.barycentric_coordinates(shadow, detached)
+    material = surface_point.interpolate_position(triangle, b1, b2)
 
     ray, edge = dr.detach(y - c), dr.detach(y1 - y0)
     stretch = dr.norm(shadow - dr.detach(c)) / dr.norm(ray)
@@ -456,4 +451,6 @@ def shadow_speed(
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
     tangent = dr.mulsign(dr.cross(normal, project_to_surface(edge)), samples.side * slope)
-    return SurfacePoint(samples.face, b1, b2), dr.dot(tangent, moving - material) * samples.weight
+    return surface_point.SurfacePoint(samples.face, b1, b2), dr.dot(
+        tangent, moving - material
+    ) * samples.weight

@@ -384,7 +384,9 @@ def visible_points(
     viewers = checked_tensor(positions, (None, 3), "radar positions [m]", "give x, y, z of each")
     visible = torch.zeros(len(points), dtype=torch.bool)
     with tracing():
-        rays = Occluders(mesh.vertices, topology_of([mesh]), viewers.detach().mean(dim=0))
+        topology = topology_of([mesh])
+        vertices = topology.join_vertices([mesh.vertices])
+        rays = Occluders(vertices, topology, viewers.detach().mean(dim=0))
         for viewer in viewers:
             hidden = torch.nonzero(~visible)[:, 0]
             visible[hidden[is_visible(rays, points[hidden], viewer.expand(len(hidden), 3))]] = True

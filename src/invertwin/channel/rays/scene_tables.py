@@ -185,8 +185,8 @@ def flatten(
             "and then replace(name, velocity=None), or simulate_chirps for motion within a frame"
         )
     parts = transform_vertices(objects)
-    vertices = torch.cat(parts)
     topology = topology_of([item.mesh for item in objects], parts, scenes)
+    vertices = topology.join_vertices(parts)
     frequency, owner = SPEED_OF_LIGHT / wavelength, topology.face_object
     surfaces, face_surface = _collect_scattering_laws(objects, frequency, owner)
     skins = surfaces.refraction.any(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -18,6 +19,7 @@ from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
 from invertwin.channel.rays.rigid_groups import find_rigid_groups
 from invertwin.checks import strip_derivatives
+from invertwin.errors import PhysicsWarning
 from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh
 
@@ -54,12 +56,21 @@ class Topology:
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
-        welded, places = mesh_topology.weld_faces(
-            vertices.numpy(), faces.numpy(), groups[owner.numpy()]
+        welded, places, edges, cracks = mesh_topology.close_cracks(
+            vertices.numpy(), faces.numpy(), groups[owner.numpy()], face_object.numpy()
         )
+        self._moves = [torch.from_numpy(column) for column in cracks[:3]]
+        if cracks.open_edges:
+            warnings.warn(
+                f"{cracks.open_edges} edges of meshes run along cracks of up to "
+                f"{100 * cracks.width:.2g} % of their size, which images, coverage and diffraction "
+                "take for openings; weld these vertices",
+                PhysicsWarning,
+                stacklevel=2,
+            )
         #: Vertices of triangles, where vertices at one place count as one.
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
-        tables = edge_tables(welded, places, face_object.numpy())
+        tables = edge_tables(welded, places, face_object.numpy(), edges)
         # Of each object, side by side: samples that follow this order are spread over its surface.
         start, end = (vertices[ends] for ends in tables[0].T)
         order = torch.from_numpy(morton_order((start + end).numpy()))
@@ -87,6 +98,18 @@ class Topology:
         self._facet_angles: Tensor | None = None
         self._mesh = mesh
         self._scene: Any = None
+
+    def join_vertices(self, parts: Sequence[Float64[Tensor, "_ 3"]]) -> Float64[Tensor, "v 3"]:
+        """Put the vertices of all objects one after the other, moved where cracks close.
+
+        Args:
+            parts: positions of each object, with derivatives [m].
+        """
+        points, (vertex, ends, share) = torch.cat(list(parts)), self._moves
+        if not len(vertex):
+            return points
+        moved = torch.lerp(points[ends[:, 0]], points[ends[:, -1]], share[:, None])
+        return points.index_put((vertex,), moved)
 
     @cached_property
     def face_edges(self) -> Int64[Tensor, "f 3"]:
@@ -214,6 +237,8 @@ def topology_of(
 
 def _open_objects(edge_faces: Tensor, face_object: Tensor) -> set[int]:
     """Objects that have an edge at which one triangle of theirs ends."""
+    if not bool(face_object.any()):  # a single one
+        return {0} if bool((edge_faces[:, 1] < 0).any()) else set()
     owners = torch.where(edge_faces >= 0, face_object[edge_faces.clamp_min(0)], -1)
     owners = owners[(owners != owners[:, :1]).any(1)]
     edge, column = torch.nonzero(owners >= 0, as_tuple=True)
@@ -253,7 +278,10 @@ def _relative_distances(
 
 
 def edge_tables(
-    faces: np.ndarray, places: np.ndarray, owner: np.ndarray | int = 0
+    faces: np.ndarray,
+    places: np.ndarray,
+    owner: np.ndarray | int = 0,
+    edges: mesh_topology.MeshEdges | None = None,
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
     """Edges of triangles, with opposite vertex and number of every triangle at the edge.
 
@@ -266,14 +294,15 @@ def edge_tables(
         faces: welded vertices of triangles, as ``weld_faces`` returns them.
         places: positions in units of the size of their group, likewise.
         owner: object of each triangle.
+        edges: their edges, where these are known.
     """
-    whole = mesh_topology.find_edges(faces, places, owner)
-    edges, counts, apex, triangle = mesh_topology.merge_doubled_sides(whole, places, owner)
-    opposite = np.full((len(edges), counts.max(initial=2)), -1, dtype=np.int64)
+    whole = edges or mesh_topology.find_edges(faces, places, owner)
+    ends, counts, apex, triangle = mesh_topology.merge_doubled_sides(whole, places, owner)
+    opposite = np.full((len(ends), counts.max(initial=2)), -1, dtype=np.int64)
     beside = opposite.copy()
     filled = np.arange(opposite.shape[1]) < counts[:, None]
     opposite[filled], beside[filled] = apex, triangle
-    return torch.from_numpy(edges), torch.from_numpy(opposite), torch.from_numpy(beside)
+    return torch.from_numpy(ends), torch.from_numpy(opposite), torch.from_numpy(beside)
 
 
 def morton_order(positions: np.ndarray) -> np.ndarray:
@@ -289,4 +318,6 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
     spread = (bits << 3 * np.arange(10)).sum(1)  # two zeros between the bits of a number
     x, y, z = spread[cells.T]
     code = x << 2 | z << 1 | y  # boresight in the highest bits
-    return code.argsort(kind="stable")
+    # Numbers below the codes keep the order of equal ones: nine times faster than a stable sort.
+    bits = len(code).bit_length()
+    return np.sort(code << bits | np.arange(len(code))) & (1 << bits) - 1

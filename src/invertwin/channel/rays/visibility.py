@@ -65,10 +65,10 @@ class ViewpointScene:
         require_surfaces(scene)
         self.names = tuple(scene.objects)
         parts = [item.vertices for item in objects]
-        self._vertices = torch.cat(parts)
         self._viewpoint = viewpoint
         with tracing():
             self._topology = topology_of([item.mesh for item in objects], parts)
+            self._vertices = self._topology.join_vertices(parts)
             fixed, origin = strip_derivatives(self._vertices), strip_derivatives(viewpoint)
             self._occluders = Occluders(fixed, self._topology, origin)
         self.face_object = self._topology.face_object

@@ -456,8 +456,8 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     objects = scene.objects
     require_surfaces(scene)
     parts = [item.vertices for item in objects.values()]
-    vertices = torch.cat(parts)
     topology = topology_of([item.mesh for item in objects.values()], parts)
+    vertices = topology.join_vertices(parts)
     facets = build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]

@@ -207,10 +207,11 @@ def prepare_path_scene(
     vertices, velocities = [item.vertices for item in objects], None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
+    topology = topology_of([item.mesh for item in objects], vertices)
     return PathScene(
         scene,
-        topology_of([item.mesh for item in objects], vertices),
-        torch.cat(vertices),
+        topology,
+        topology.join_vertices(vertices),
         velocities,
         *ends,
         *speeds,
