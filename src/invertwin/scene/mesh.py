@@ -69,7 +69,7 @@ class Mesh:
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
         faces = strip_derivatives(self.faces).numpy()
-        counts = mesh_topology.close_cracks(points, faces)[2].counts
+        counts = mesh_topology.close_cracks(points, faces)[1].counts
         x, y, z = np.ptp(points, axis=0).tolist()
         edges = int((counts == 1).sum()), int((counts > 2).sum())
         return MeshSummary((x, y, z), len(self.faces), *edges)

@@ -60,7 +60,7 @@ def find_defects(mesh: Mesh) -> MeshDefects:
     if mesh not in _found:
         plain = Mesh(*map(strip_derivatives, (mesh.vertices, mesh.faces)))
         points = plain.vertices.numpy()
-        welded, places, _, cracks = mesh_topology.close_cracks(points, plain.faces.numpy())
+        welded, _, places, cracks = mesh_topology.close_cracks(points, plain.faces.numpy())
         _found[mesh] = MeshDefects(
             int(find_doubled_faces(welded, places).sum()),
             cracks.open_edges,

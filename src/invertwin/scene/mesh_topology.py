@@ -28,25 +28,11 @@ _LINE = 0.8191, 0.4731, 0.3244  # a direction across no planes that people draw
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
 _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MAX_CRACK_SHARE = 1e-3  # of the edges on both sides: width of the widest cracks that are closed
-_WIDEST_CRACK = 1e-3  # of the size, and ten times this share: of the widest that are named
 _MAX_OFFSET = 1e-7  # of welded vertices that need not move, relative to the size
 _MIN_PARALLEL_COSINE = 0.995  # of these edges
 _MAX_FOLD_COSINE = (
     0.985  # of surfaces that go on across a crack: sheets that lie side by side do not
 )
-
-
-def weld_faces(
-    points: Points, faces: Int64[np.ndarray, "f 3"], groups: Groups | None = None
-) -> tuple[Int64[np.ndarray, "f 3"], Points]:
-    """Return triangles by welded vertices, and positions in units of the size of their group.
-
-    Args:
-        points: positions [m].
-        faces: vertices of each triangle.
-        groups: group of each vertex, from 0; only those of one group are welded. None = one.
-    """
-    return close_cracks(points, faces, groups)[:2]
 
 
 class Cracks(NamedTuple):
@@ -72,8 +58,8 @@ def close_cracks(
     faces: Int64[np.ndarray, "f 3"],
     groups: Groups | None = None,
     owner: Int64[np.ndarray, " f"] | int = 0,
-) -> tuple[Int64[np.ndarray, "f 3"], Points, MeshEdges, Cracks]:
-    """Weld vertices and close cracks: triangles, positions, edges, and what closes the cracks.
+) -> tuple[Int64[np.ndarray, "f 3"], MeshEdges, Points, Cracks]:
+    """Weld vertices and close cracks: triangles, edges, positions, and what closes the cracks.
 
     Positions are in units of the size of their group, vertices where they have moved.
 
@@ -102,68 +88,49 @@ def close_cracks(
     if (ends != first[vertex, None]).any():
         welded = weld_vertices(places)[faces]
         edges = find_edges(welded, places, owner)
-    return welded, places, edges, Cracks(vertex, ends, share, open_edges, width)
+    return welded, edges, places, Cracks(vertex, ends, share, open_edges, width)
 
 
 def _find_cracks(
     edges: MeshEdges, places: Points
 ) -> tuple[Int64[np.ndarray, "v 2"], Float64[np.ndarray, " v"], int, float]:
-    """Find where vertices beside open edges have to move to close cracks.
+    """Find where vertices beside open edges have to move for surfaces that go on there to close.
 
     Returns:
         Ends of an edge and position on it for each vertex, twice itself for most; number of edges
         along cracks that stay open, and width of the widest.
     """
-    lowest, along = np.arange(len(places)), np.zeros(len(places))
-    row, vertex, share, gap = _find_edges_across(edges, places)
-    ends = edges.ends[row]
-    start, end = np.moveaxis(places[ends], 1, 0)
-    length = np.linalg.norm(end - start, axis=1)
-    reach = np.minimum(CRACK_TOLERANCE, _MAX_CRACK_SHARE * length)
-    near = gap <= reach
-    at_end = near & (np.minimum(share, 1 - share) * length <= reach)
-    if at_end.any():
-        nearest = np.where(share > 0.5, ends[:, 1], ends[:, 0])
-        chain = label_components(np.stack([vertex, nearest], 1)[at_end], len(places))
-        lowest = np.unique(chain, return_index=True)[1][chain]
-    onto, own, ends = np.stack([lowest, lowest], 1), lowest[vertex], lowest[ends]
+    is_open = edges.counts == 1
+    ends, apex = edges.ends[is_open], edges.apex[np.cumsum(edges.counts)[is_open] - 1]
+    start, side = places[ends[:, 0]], places[ends[:, 1]] - places[ends[:, 0]]
+    length, axis, into = np.linalg.norm(side, axis=1), _unit(side), places[apex] - start
+    into = _unit(into - (into * axis).sum(1)[:, None] * axis)
+    # Ends of each edge by themselves, of which those count whose edge runs along the other.
+    corners = len(places) + np.arange(2 * len(ends))
+    points = np.concatenate([places, places[ends.ravel()]])
+    row, corner, share = find_vertices_on_edges(ends, corners, points, 10 * CRACK_TOLERANCE)
+    beside, vertex = (corner - len(places)) // 2, ends.ravel()[corner - len(places)]
+    share = share.clip(0.0, 1.0)
+    gap = np.linalg.norm(places[vertex] - start[row] - share[:, None] * side[row], axis=1)
+    reach = np.minimum(_MAX_CRACK_SHARE * np.minimum(length[row], length[beside]), CRACK_TOLERANCE)
+    goes_on = (gap <= 10 * reach) & (vertex[:, None] != ends[row]).all(1)
+    goes_on &= np.abs((axis[row] * axis[beside]).sum(1)) > _MIN_PARALLEL_COSINE
+    goes_on &= (into[row] * into[beside]).sum(1) < _MAX_FOLD_COSINE
+    row, vertex, share, gap, reach = (x[goes_on] for x in (row, vertex, share, gap, reach))
+    at_end = (gap <= reach) & (np.minimum(share, 1 - share) * length[row] <= reach)
+    nearest = np.where(share > 0.5, ends[row, 1], ends[row, 0])
+    chain = label_components(np.stack([vertex, nearest], 1)[at_end], len(places))
+    lowest = np.unique(chain, return_index=True)[1][chain]
+    onto, own, others = np.stack([lowest, lowest], 1), lowest[vertex], lowest[ends[row]]
     # An edge onto which a vertex moves stays where it is; of several edges, the nearest counts.
     rest = np.argsort(-gap, kind="stable")
-    rest = rest[(near & ~at_end)[rest]]
-    rest = rest[~np.isin(ends[rest], own[rest]).any(1)]
-    onto[own[rest]], along[own[rest]] = ends[rest], share[rest]
-    left = ~(own[:, None] == ends).any(1) & (onto[own, 0] == own)
-    found = onto[lowest], along[lowest]
-    return *found, len(np.unique(row[left])), float(gap[left].max(initial=0.0))
-
-
-def _find_edges_across(
-    edges: MeshEdges, places: Points
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Find vertices beside open edges at which the surface goes on: edge, vertex, position, gap."""
-    open_edges = np.flatnonzero(edges.counts == 1)
-    ends = edges.ends[open_edges]
-    apex = edges.apex[(np.cumsum(edges.counts) - edges.counts)[open_edges]]
-    row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places, _WIDEST_CRACK)
-    other = (vertex[:, None] != ends[row]).all(1)
-    row, vertex, share = row[other], vertex[other], share[other].clip(0.0, 1.0)
-    start, end = np.moveaxis(places[ends], 1, 0)
-    side, into = end - start, places[apex] - start
-    length, axis = np.linalg.norm(side, axis=1), _unit(side)
-    into = _unit(into - (into * axis).sum(1)[:, None] * axis)
-    gap = np.linalg.norm(places[vertex] - start[row] - share[:, None] * side[row], axis=1)
-    # Of all open edges that end in the vertex, one must run along the edge.
-    order = np.argsort(ends.ravel(), kind="stable")
-    begin, until = (np.searchsorted(ends.ravel()[order], vertex, at) for at in ("left", "right"))
-    entry = np.repeat(np.arange(len(row)), until - begin)
-    step = np.arange(len(entry)) - np.searchsorted(entry, entry)
-    beside, mine = order[begin[entry] + step] // 2, row[entry]
-    goes_on = np.abs((axis[mine] * axis[beside]).sum(1)) > _MIN_PARALLEL_COSINE
-    goes_on &= (into[mine] * into[beside]).sum(1) < _MAX_FOLD_COSINE
-    shortest = np.minimum(length[mine], length[beside])
-    goes_on &= gap[entry] <= _WIDEST_CRACK / CRACK_TOLERANCE * _MAX_CRACK_SHARE * shortest
-    kept = np.unique(entry[goes_on])
-    return open_edges[row[kept]], vertex[kept], share[kept], gap[kept]
+    rest = rest[((gap <= reach) & ~at_end)[rest]]
+    rest = rest[~np.isin(others[rest], own[rest]).any(1)]
+    along = np.zeros(len(places))
+    onto[own[rest]], along[own[rest]] = others[rest], share[rest]
+    left = (own[:, None] != others).all(1) & (onto[own, 0] == own)
+    width = float(gap[left].max(initial=0.0))
+    return onto[lowest], along[lowest], len(np.unique(row[left])), width
 
 
 def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:

@@ -43,7 +43,8 @@ def unite_parts(mesh: Mesh) -> Mesh:
         mesh: parts of one material, without derivatives.
     """
     points = strip_derivatives(mesh.vertices).numpy()
-    welded, places = mesh_topology.weld_faces(points, strip_derivatives(mesh.faces).numpy())
+    faces = strip_derivatives(mesh.faces).numpy()
+    welded, _, places, _ = mesh_topology.close_cracks(points, faces)
     part = mesh_topology.find_parts(welded, places)
     bodies, united = list[manifold3d.Manifold](), np.zeros(len(welded), dtype=bool)
     for number in _touching_parts(welded, part, places):

@@ -11,7 +11,7 @@ from invertwin.channel import Grid, Link, Sampling, deposit_power
 from invertwin.channel.rays.topology import edge_tables
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, sphere
-from invertwin.scene.mesh_topology import weld_faces
+from invertwin.scene.mesh_topology import close_cracks
 from scenes import GRID, WAVELENGTH, float64, link, occluder, relative, shift_error, thing
 
 WALL = thing(plate(2.0, 2.0, divisions=2), (2, 0, 0))
@@ -116,20 +116,24 @@ def test_objects_that_start_at_one_place_may_part():
 def test_edges_of_a_mesh_with_split_vertices():
     cube = box(1.0)
     for mesh in (cube, halves(cube)):
-        edges, opposite, _ = edge_tables(*weld_faces(mesh.vertices.numpy(), mesh.faces.numpy()))
+        edges, opposite, _ = edge_tables(
+            *close_cracks(mesh.vertices.numpy(), mesh.faces.numpy())[1:3]
+        )
         assert len(edges) == 18
         assert opposite.shape == (18, 2)
         assert (opposite >= 0).all()
-    edges, opposite, _ = edge_tables(*weld_faces(plain().vertices.numpy(), plain().faces.numpy()))
+    edges, opposite, _ = edge_tables(
+        *close_cracks(plain().vertices.numpy(), plain().faces.numpy())[1:3]
+    )
     assert sorted((opposite >= 0).sum(1).tolist()) == [1, 1, 1, 1, 2]
     _, opposite, _ = edge_tables(
-        *weld_faces(finned(plain()).vertices.numpy(), finned(plain()).faces.numpy())
+        *close_cracks(finned(plain()).vertices.numpy(), finned(plain()).faces.numpy())[1:3]
     )
     assert opposite.shape[1] == 3
 
 
 def test_edges_of_a_mesh_that_is_a_point():
-    edges, opposite, _ = edge_tables(*weld_faces(np.zeros((3, 3)), np.array([[0, 1, 2]])))
+    edges, opposite, _ = edge_tables(*close_cracks(np.zeros((3, 3)), np.array([[0, 1, 2]]))[1:3])
     assert len(edges) == 0
     assert len(opposite) == 0
 

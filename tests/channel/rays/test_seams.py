@@ -23,9 +23,9 @@ from invertwin.scene.mesh import concatenate_meshes
 from invertwin.scene.mesh_topology import (
     CRACK_TOLERANCE,
     WELD_TOLERANCE,
+    close_cracks,
     find_vertices_on_edges,
     separate_groups,
-    weld_faces,
     weld_vertices,
 )
 
@@ -49,7 +49,9 @@ def plates_of_a_box(side=0.4):
 
 def table(mesh):
     """Number of edges by number of triangles."""
-    _, _, faces = edge_tables(*weld_faces(mesh.vertices.detach().numpy(), mesh.faces.numpy()))
+    _, _, faces = edge_tables(
+        *close_cracks(mesh.vertices.detach().numpy(), mesh.faces.numpy())[1:3]
+    )
     numbers, counts = (faces >= 0).sum(1).unique(return_counts=True)
     return dict(zip(numbers.tolist(), counts.tolist(), strict=True))
 
@@ -152,7 +154,7 @@ def test_an_edge_ends_where_vertices_lie_on_it():
     """A long side of one triangle against two short ones of others: a T-junction."""
     vertices = float64([0, 0, 0], [2, 0, 0], [1, 1, 0], [0.5, 0, 0], [1, -1, 0])
     mesh = Mesh(vertices, torch.tensor([[0, 1, 2], [0, 4, 3], [3, 4, 1]]))
-    edges, apexes, faces = edge_tables(*weld_faces(vertices.numpy(), mesh.faces.numpy()))
+    edges, apexes, faces = edge_tables(*close_cracks(vertices.numpy(), mesh.faces.numpy())[1:3])
     rows = {tuple(edge): k for k, edge in enumerate(edges.tolist())}
     assert (0, 1) not in rows
     for pair, below in (((0, 3), 1), ((1, 3), 2)):
@@ -197,7 +199,7 @@ def test_doubled_faces_count_once_at_their_edges():
     assert table(doubled) == {2: 19}  # and the other diagonal
     two = torch.cat([torch.zeros(12), torch.ones(2)]).long()  # of an object of its own
     _, _, faces = edge_tables(
-        *weld_faces(doubled.vertices.numpy(), doubled.faces.numpy()), two.numpy()
+        *close_cracks(doubled.vertices.numpy(), doubled.faces.numpy())[1:3], two.numpy()
     )
     assert ((faces >= 0).sum(1) == 3).sum() == 4
 

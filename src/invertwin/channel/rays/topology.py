@@ -56,7 +56,7 @@ class Topology:
         # Vertices of triangles, the first of each object among them, and the object of each.
         first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
         self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
-        welded, places, edges, cracks = mesh_topology.close_cracks(
+        welded, edges, places, cracks = mesh_topology.close_cracks(
             vertices.numpy(), faces.numpy(), groups[owner.numpy()], face_object.numpy()
         )
         self._moves = [torch.from_numpy(column) for column in cracks[:3]]
@@ -70,7 +70,7 @@ class Topology:
             )
         #: Vertices of triangles, where vertices at one place count as one.
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
-        tables = edge_tables(welded, places, face_object.numpy(), edges)
+        tables = edge_tables(edges, places, face_object.numpy())
         # Of each object, side by side: samples that follow this order are spread over its surface.
         start, end = (vertices[ends] for ends in tables[0].T)
         order = torch.from_numpy(morton_order((start + end).numpy()))
@@ -278,10 +278,7 @@ def _relative_distances(
 
 
 def edge_tables(
-    faces: np.ndarray,
-    places: np.ndarray,
-    owner: np.ndarray | int = 0,
-    edges: mesh_topology.MeshEdges | None = None,
+    edges: mesh_topology.MeshEdges, places: np.ndarray, owner: np.ndarray | int = 0
 ) -> tuple[Int64[Tensor, "e 2"], Int64[Tensor, "e k"], Int64[Tensor, "e k"]]:
     """Edges of triangles, with opposite vertex and number of every triangle at the edge.
 
@@ -291,13 +288,11 @@ def edge_tables(
     ones are −1.
 
     Args:
-        faces: welded vertices of triangles, as ``weld_faces`` returns them.
+        edges: edges of triangles, as ``close_cracks`` returns them.
         places: positions in units of the size of their group, likewise.
         owner: object of each triangle.
-        edges: their edges, where these are known.
     """
-    whole = edges or mesh_topology.find_edges(faces, places, owner)
-    ends, counts, apex, triangle = mesh_topology.merge_doubled_sides(whole, places, owner)
+    ends, counts, apex, triangle = mesh_topology.merge_doubled_sides(edges, places, owner)
     opposite = np.full((len(ends), counts.max(initial=2)), -1, dtype=np.int64)
     beside = opposite.copy()
     filled = np.arange(opposite.shape[1]) < counts[:, None]
