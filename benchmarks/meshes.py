@@ -7,10 +7,11 @@ corners agree to rounding), `panels` (six objects), `finer`, `diagonals` (the ot
 face), `junctions` (one face of eight triangles against undivided neighbours), `overlapping` (two
 boxes with shared planes, united), `raw` (these as they are), `doubled` (a face twice, along both
 diagonals), `inside_out`, `mixed` (every third triangle turned), `cracked` (by 1e-9 m), `soup`
-(three float32 corners a triangle, as in an STL file). Of a car, a chair and a room (`bodies.py`):
-`file` (a float32 STL, loaded), `raw` (all parts in one mesh) and `objects` (each part one). Of a
-wall on part of a floor's edge: `raw`, `objects`, and both with the wall 1e-9 m below the floor
-(`sunk`) or above. Prints tables and writes `metrics.json` into DIR (default `out/meshes`):
+(three float32 corners a triangle, as in an STL file), `jittered` (these up to 1e-5 of the size
+apart). Of a car, a chair and a room (`bodies.py`): `file` (a float32 STL, loaded), `raw` (all parts
+in one mesh) and `objects` (each part one). Of a wall on part of a floor's edge: `raw`, `objects`,
+and both with the wall 1e-9 m below the floor (`sunk`) or above. Prints tables and writes
+`metrics.json` into DIR (default `out/meshes`):
 
 - `value.<mechanism>.<mesh>`, `derivative.<mechanism>.<mesh>`: ⟨a, b⟩/⟨b, b⟩ of a quantity a and
   that of the clean mesh, b; its derivative is with respect to a translation that turns.
@@ -123,6 +124,9 @@ def meshes() -> dict[str, Parts]:
     """The clean box first, then the others."""
     clean = iw.box(SIZE)
     corners = clean.vertices[clean.faces].reshape(-1, 3)
+    triples = torch.arange(len(corners)).reshape(-1, 3)
+    random = torch.randn(corners.shape, generator=torch.Generator().manual_seed(0)).double()
+    away = torch.nn.functional.normalize(random, dim=1)
     flipped = clean.faces.clone()
     flipped[::3] = flipped[::3].flip(1)
     front = clean.faces[8:10]
@@ -149,7 +153,8 @@ def meshes() -> dict[str, Parts]:
         "inside_out": [Mesh(clean.vertices, clean.faces.flip(1))],
         "mixed": [Mesh(clean.vertices, flipped)],
         "cracked": [merge_meshes(crack)],
-        "soup": [Mesh(corners.float().double(), torch.arange(len(corners)).reshape(-1, 3))],
+        "soup": [Mesh(corners.float().double(), triples)],
+        "jittered": [Mesh(corners + 0.5e-5 * float(vector(*SIZE).norm()) * away, triples)],
     }
 
 

@@ -189,10 +189,8 @@ class _ImageRenderer:
         along = (marks[1] - marks[0])[row] / length[row, None]
         across = torch.stack([-along[:, 1], along[:, 0]], 1)
         aside = _OUTLINE_OFFSET * fixed.focal
-        low_side, high_side = (
-            strip_derivatives(self.sample_image(here + sign * aside * across, fixed))
-            for sign in (-1.0, 1.0)
-        )
+        sides = [self.sample_image(here + sign * aside * across, fixed) for sign in (-1.0, 1.0)]
+        low_side, high_side = map(strip_derivatives, sides)
         sweep = ((place - here) * across).sum(1) * (float(until[-1]) / count)
         rows = torch.nonzero(((here >= 0) & (here < size)).all(1) & (low_side != high_side))[:, 0]
         column, line = here[rows].long().unbind(1)

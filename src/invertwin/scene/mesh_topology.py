@@ -401,7 +401,8 @@ def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
     pairs = _pairs_at_edges(edges, edges.triangle)
     if len(pairs):
         part = label_components(pairs, int(pairs.max()) + 1)[pairs[:, 0]]
-        candidates[~candidates] = near_other_parts(places[edges.ends[~candidates]], part)
+        if part.any():  # not a single one
+            candidates[~candidates] = near_other_parts(places[edges.ends[~candidates]], part)
     rows = np.flatnonzero(candidates)
     ends = edges.ends[rows]
     row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places)

@@ -18,8 +18,8 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
-from invertwin.channel.rays.scene_tables import require_surfaces
-from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rays.scene_tables import connect_surfaces
+from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
 from invertwin.deprecation import rename_arguments
@@ -100,11 +100,7 @@ def visible_fractions(
     Raises:
         InputError: a cloud among the objects.
     """
-    require_surfaces(scene)
-    items = list(scene.objects.values())
-    parts = [item.vertices for item in items]
-    topology = topology_of([item.mesh for item in items], parts)
-    vertices = topology.join_vertices(parts)
+    topology, vertices = connect_surfaces(scene)
     fixed, origins = strip_derivatives(vertices), strip_derivatives(observers)
     center, axes, offsets = map(strip_derivatives, (cells.center, cells.axes, cells.offsets))
     panel = PanelCells(center, axes, offsets, cells.size)

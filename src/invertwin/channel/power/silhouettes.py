@@ -226,10 +226,8 @@ class SilhouetteSampler:
         near = MISS_DISTANCE * dr.norm(exact)
         valid &= ~is_hidden_by_fold(rays, edge, y, exact, sides.outward, aside, near, valid)
         place = index, receiver, frame, first, second, sides.side, along, face
-        weight, transmission = (
-            1 / (pmf * self.size * hit.probability),
-            before.then(hit.transmission),
-        )
+        weight = 1 / (pmf * self.size * hit.probability)
+        transmission = before.then(hit.transmission)
         samples = SilhouetteSample(*place, weight, transmission, sides.open, sides.covered)
         return SampleBatch(valid, samples)
 

@@ -104,12 +104,10 @@ def _find_visible_pairs(
     """Find those of some pairs of objects that are coplanar at a point that an antenna sees."""
     geometry, link, count = rays.geometry, rays.link, rays.poses_per_scene
     looks = torch.arange(0, count, max(1, -(-count // _MAX_POSES)))
-    views = torch.cat(
-        [ends.detach().unflatten(0, (-1, count))[:, looks] for ends in (link.tx, link.rx)], 1
-    )
+    views = [ends.detach().unflatten(0, (-1, count))[:, looks] for ends in (link.tx, link.rx)]
     # Derivatives are wrong in a contact that is seen through sheets, such as below a box of them.
     sheets = geometry.surfaces.transmittance.any(1) & any(geometry.differentiated)
-    given = geometry.vertices.detach(), pairs, views, sheets[geometry.face_surface]
+    given = geometry.vertices.detach(), pairs, torch.cat(views, 1), sheets[geometry.face_surface]
     return _find_seen_pairs(rays, *given, geometry.object_scene)
 
 
@@ -126,9 +124,8 @@ def _find_seen_pairs(
     pairs, low, high = find_overlapping_boxes(topology, vertices, pairs)
     points = vertices - rays.origin
     triangles, owner = points[topology.faces], topology.face_object
-    near = (triangles.amin(1) <= (high - rays.origin)[owner]) & (
-        triangles.amax(1) >= (low - rays.origin)[owner]
-    )
+    low, high = ((bound - rays.origin)[owner] for bound in (low, high))
+    near = (triangles.amin(1) <= high) & (triangles.amax(1) >= low)
     faces = near.all(1).nonzero()[:, 0]
     if not len(faces):
         return found

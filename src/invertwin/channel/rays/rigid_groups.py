@@ -80,7 +80,7 @@ def _find_contacts(
     both = torch.cat(points)
     if key in _contacts:
         _, before, found = _contacts[key]
-        if _is_one_motion(before, both):
+        if is_one_motion(before, both):
             _contacts.move_to_end(key)
             return found
     low = torch.maximum(points[0].amin(0), points[1].amin(0))
@@ -107,8 +107,12 @@ def _find_contacts(
     return found
 
 
-def _is_one_motion(before: Tensor, after: Tensor) -> bool:
-    """Test whether a rotation and a translation take points to others, the best of all (Kabsch)."""
+def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"]) -> bool:
+    """Test whether a rotation and a translation take points to others, the best of all (Kabsch).
+
+    Args:
+        before, after: positions [m].
+    """
     if before.shape != after.shape or torch.equal(before, after):
         return before.shape == after.shape
     one, other = before - before.mean(0), after - after.mean(0)

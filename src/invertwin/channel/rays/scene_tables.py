@@ -151,6 +151,21 @@ def require_surfaces(scene: Scene, hint: str = "mesh them") -> None:
         raise InputError(f"expected objects with surfaces, got clouds for {names}; {hint}")
 
 
+def connect_surfaces(scene: Scene) -> tuple[Topology, Float64[Tensor, "v 3"]]:
+    """Return the topology of all objects, and their vertices in the world where cracks close [m].
+
+    Args:
+        scene: scene whose objects must be meshes.
+
+    Raises:
+        InputError: a cloud in the scene.
+    """
+    require_surfaces(scene)
+    parts = [item.vertices for item in scene.objects.values()]
+    topology = topology_of([item.mesh for item in scene.objects.values()], parts)
+    return topology, topology.join_vertices(parts)
+
+
 def flatten(
     scene: Scene,
     wavelength: float,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -17,17 +17,15 @@ from torch._C import _DisableFuncTorch
 
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
-from invertwin.channel.rays.rigid_groups import find_rigid_groups
+from invertwin.channel.rays.rigid_groups import find_rigid_groups, is_one_motion
 from invertwin.checks import strip_derivatives
 from invertwin.errors import PhysicsWarning
 from invertwin.scene import mesh_topology
 from invertwin.scene.mesh import Mesh
 
 _MAX_CACHED_TOPOLOGIES = 8
-_MIN_SMOOTH_ANGLE, _MAX_SMOOTH_ANGLE = (
-    1e-6,
-    0.35,
-)  # radians: rounding of coordinates; an edge of the object itself
+_MIN_SMOOTH_ANGLE = 1e-6  # rad: rounding of coordinates
+_MAX_SMOOTH_ANGLE = 0.35  # rad: an edge of the object itself
 _MAX_UNGROUPED_FACES = 256  # triangles that are not worth a group
 
 
@@ -62,9 +60,8 @@ class Topology:
         self._moves = [torch.from_numpy(column) for column in cracks[:3]]
         if cracks.open_edges:
             warnings.warn(
-                f"{cracks.open_edges} edges of meshes run along cracks of up to "
-                f"{100 * cracks.width:.2g} % of their size, which images, coverage and diffraction "
-                "take for openings; weld these vertices",
+                f"{cracks.open_edges} edges of meshes run along cracks of up to {cracks.width:.2g} "
+                "of their size, which count as openings of the surface; weld the vertices",
                 PhysicsWarning,
                 stacklevel=2,
             )
@@ -181,14 +178,12 @@ class Topology:
         """
         if backend() == "cuda" or len(self.faces) <= _MAX_UNGROUPED_FACES:
             return {"mesh": self._mesh}
-        reference = {"type": "ref", "id": "group"}
-        return {
-            "group": {"type": "shapegroup", "mesh": self._mesh},
-            "instance": {"type": "instance", "group": reference},
-        }
+        group = {"type": "shapegroup", "mesh": self._mesh}
+        instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+        return {"group": group, "instance": instance}
 
 
-_topologies: OrderedDict[tuple, tuple[list[Tensor], Tensor | None, Topology]] = OrderedDict()
+_topologies: OrderedDict[tuple, tuple[list[Tensor], dict[int, Tensor], Topology]] = OrderedDict()
 
 
 def topology_of(
@@ -211,16 +206,14 @@ def topology_of(
             groups = find_rigid_groups(faces, vertices, scenes)
         joined = np.flatnonzero(np.bincount(groups)[groups] > 1).tolist()
         world = {} if vertices is None else {n: strip_derivatives(vertices[n]) for n in joined}
-        relative = _relative_distances(world, groups) if world else None
+        bodies = {
+            g: torch.cat([world[n] for n in joined if groups[n] == g]) for g in groups[joined]
+        }
         # The entry holds the face tensors, so that their ids stay theirs.
         key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces))
-        _, known, found = _topologies.get(key, (faces, None, None))
-        if known is not None and relative is not None:
-            same = known.shape == relative.shape and torch.allclose(
-                known, relative, rtol=1e-8, atol=1e-9
-            )
-            found = found if same else None
-        if found is None:
+        _, known, found = _topologies.get(key, (faces, bodies, None))
+        # The seams of a group stay as they are while its objects move as one body.
+        if found is None or not all(is_one_motion(known[g], bodies[g]) for g in bodies):
             starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
             fixed = [strip_derivatives(mesh.vertices) for mesh in meshes]
             own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
@@ -228,7 +221,7 @@ def topology_of(
             # Joined objects in the world; else in their own frames, where no pose changes a seam.
             points = torch.cat([world.get(n, own_frame) for n, own_frame in enumerate(fixed)])
             found = Topology(torch.cat(own), owner, points, groups)
-            _topologies[key] = faces, relative, found
+            _topologies[key] = faces, bodies, found
         while len(_topologies) > _MAX_CACHED_TOPOLOGIES:
             _topologies.popitem(last=False)
     _topologies.move_to_end(key)
@@ -261,20 +254,6 @@ def _turn_outwards(
         own = face_object == number
         inward[own] = torch.from_numpy(mesh_topology.find_inward_faces(welded[own.numpy()], places))
     return torch.where(inward[:, None], faces.flip(1), faces)
-
-
-def _relative_distances(
-    points: Mapping[int, Tensor], groups: np.ndarray
-) -> Float64[Tensor, "row 16"]:
-    """Distances from corners of each joined object to those of the first one of its group [m].
-
-    They stay while the objects of a group move as one body, of which the seams stay as they are.
-    """
-    first, rows = dict[int, Tensor](), []
-    for number, own in points.items():
-        own = own[torch.linspace(0, len(own) - 1, 4).long()]
-        rows.append(torch.cdist(own, first.setdefault(groups[number], own)).flatten())
-    return torch.stack(rows)
 
 
 def edge_tables(

@@ -19,8 +19,7 @@ from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.ray_scene import Occluders
-from invertwin.channel.rays.scene_tables import require_surfaces
-from invertwin.channel.rays.topology import topology_of
+from invertwin.channel.rays.scene_tables import connect_surfaces
 from invertwin.channel.rows import concatenate_rows
 from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.deprecation import rename_arguments
@@ -61,14 +60,10 @@ class ViewpointScene:
 
     @rename_arguments(place="viewpoint")
     def __init__(self, scene: Scene, viewpoint: Float64[Tensor, "3"]) -> None:
-        objects = scene.objects.values()
-        require_surfaces(scene)
         self.names = tuple(scene.objects)
-        parts = [item.vertices for item in objects]
         self._viewpoint = viewpoint
         with tracing():
-            self._topology = topology_of([item.mesh for item in objects], parts)
-            self._vertices = self._topology.join_vertices(parts)
+            self._topology, self._vertices = connect_surfaces(scene)
             fixed, origin = strip_derivatives(self._vertices), strip_derivatives(viewpoint)
             self._occluders = Occluders(fixed, self._topology, origin)
         self.face_object = self._topology.face_object

@@ -33,8 +33,8 @@ from invertwin.channel.em import wedges as wedge_geometry
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
-from invertwin.channel.rays.scene_tables import require_surfaces
-from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rays.scene_tables import connect_surfaces
+from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rcs import rays_in_dielectrics
 from invertwin.channel.rcs.dielectric_interfaces import incident_power, scatter_at_interfaces
 from invertwin.channel.rcs.moments.efie_solver import EFIESolver
@@ -453,20 +453,15 @@ def _split_edges(wedges: wedge_geometry.Wedges, max_length: float) -> wedge_geom
 
 
 def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTarget:
-    objects = scene.objects
-    require_surfaces(scene)
-    parts = [item.vertices for item in objects.values()]
-    topology = topology_of([item.mesh for item in objects.values()], parts)
-    vertices = topology.join_vertices(parts)
+    topology, vertices = connect_surfaces(scene)
     facets = build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
-    owner, names = topology.face_object, list(objects)
+    owner, names = topology.face_object, list(scene.objects)
     dielectric_solids.require_whole_solids(tables[0], topology.panels, owner, names)
-    solids = dielectric_solids.group_solids(
-        tables, wave_numbers, facets.corners, facets.solid, owner, names
-    )
+    bodies = facets.corners, facets.solid, owner, names
+    solids = dielectric_solids.group_solids(tables, wave_numbers, *bodies)
     return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
 

@@ -8,6 +8,7 @@ of incidence to the next.
 Source: derivations §10.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +22,8 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin.channel.em import plane_waves
 from invertwin.channel.rays.backend import tracing
-from invertwin.channel.rays.scene_tables import require_surfaces, vertex_velocities
-from invertwin.channel.rays.topology import Topology, topology_of
+from invertwin.channel.rays.scene_tables import connect_surfaces, vertex_velocities
+from invertwin.channel.rays.topology import Topology
 from invertwin.channel.specular.candidates import FaceInteractions, find_sequences
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import (
@@ -197,26 +198,16 @@ def prepare_path_scene(
     Raises:
         InputError: a cloud in the scene, or antennas of wrong shape.
     """
-    objects = scene.objects.values()
-    require_surfaces(scene)
+    topology, vertices = connect_surfaces(scene)
     ends = checked_rows(tx, "tx positions [m]"), checked_rows(rx, "rx positions [m]")
-    speeds = (
-        _check_velocities(tx_velocity, len(ends[0]), "tx"),
-        _check_velocities(rx_velocity, len(ends[1]), "rx"),
-    )
-    vertices, velocities = [item.vertices for item in objects], None
+    given = zip((tx_velocity, rx_velocity), map(len, ends), ("tx", "rx"), strict=True)
+    tx_speed, rx_speed = itertools.starmap(_check_velocities, given)
+    objects, velocities = scene.objects.values(), None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
-    topology = topology_of([item.mesh for item in objects], vertices)
-    return PathScene(
-        scene,
-        topology,
-        topology.join_vertices(vertices),
-        velocities,
-        *ends,
-        *speeds,
-        checked_number(frequency, "frequency [Hz]", 0.0, open_low=True),
-    )
+    surfaces = scene, topology, vertices, velocities
+    frequency = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    return PathScene(*surfaces, *ends, tx_speed, rx_speed, frequency)
 
 
 def _check_velocities(value: ArrayLike, count: int, what: str) -> Tensor:
