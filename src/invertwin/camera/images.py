@@ -163,8 +163,7 @@ class _ImageRenderer:
         """Return the contribution of outlines to derivatives; zero in value."""
         camera, fixed, number = self.camera, self.fixed, self.number
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        both = [fixed.to_camera_axes(end, number) for end in (curves.start, curves.end)]
-        ends = torch.stack(both)
+        ends = torch.stack([fixed.to_camera_axes(v, number) for v in (curves.start, curves.end)])
         low, high = _clip_segments(ends, fixed, size)
         piece = torch.nonzero(high > low)[:, 0]
         ends = ends[:, piece]

@@ -68,11 +68,10 @@ class Mesh:
     def summary(self) -> "MeshSummary":
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
         points = strip_derivatives(self.vertices).numpy()
-        faces = strip_derivatives(self.faces).numpy()
-        counts = mesh_topology.close_cracks(points, faces)[1].counts
+        edges = mesh_topology.close_cracks(points, strip_derivatives(self.faces).numpy())[1]
         x, y, z = np.ptp(points, axis=0).tolist()
-        edges = int((counts == 1).sum()), int((counts > 2).sum())
-        return MeshSummary((x, y, z), len(self.faces), *edges)
+        single, several = (int(mask.sum()) for mask in (edges.counts == 1, edges.counts > 2))
+        return MeshSummary((x, y, z), len(self.faces), single, several)
 
     @property
     def center(self) -> Float64[Tensor, "3"]:

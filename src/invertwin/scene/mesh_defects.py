@@ -38,12 +38,11 @@ class MeshDefects(NamedTuple):
 
     def in_words(self) -> list[str]:
         """List the defects that the mesh has."""
+        cracks = f"{self.cracked_edges} edges along cracks {self.crack_width:.2g} m wide"
         named = {
             "closed parts that overlap or touch": self.has_overlapping_parts,
             f"{self.doubled_triangles} triangles on others": self.doubled_triangles,
-            f"{self.cracked_edges} edges along cracks {self.crack_width:.2g} m wide": (
-                self.cracked_edges > 0
-            ),
+            cracks: self.cracked_edges,
         }
         return [text for text, is_there in named.items() if is_there]
 
@@ -61,12 +60,10 @@ def find_defects(mesh: Mesh) -> MeshDefects:
         plain = Mesh(*map(strip_derivatives, (mesh.vertices, mesh.faces)))
         points = plain.vertices.numpy()
         welded, _, places, cracks = mesh_topology.close_cracks(points, plain.faces.numpy())
-        _found[mesh] = MeshDefects(
-            int(find_doubled_faces(welded, places).sum()),
-            cracks.open_edges,
-            cracks.width * float(np.linalg.norm(np.ptp(points, axis=0))),
-            unite_parts(plain) is not plain,
-        )
+        doubled = int(find_doubled_faces(welded, places).sum())
+        width = cracks.width * float(np.linalg.norm(np.ptp(points, axis=0)))
+        overlaps = unite_parts(plain) is not plain
+        _found[mesh] = MeshDefects(doubled, cracks.open_edges, width, overlaps)
     return _found[mesh]
 
 

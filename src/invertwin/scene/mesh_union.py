@@ -42,8 +42,7 @@ def unite_parts(mesh: Mesh) -> Mesh:
     Args:
         mesh: parts of one material, without derivatives.
     """
-    points = strip_derivatives(mesh.vertices).numpy()
-    faces = strip_derivatives(mesh.faces).numpy()
+    points, faces = (strip_derivatives(table).numpy() for table in (mesh.vertices, mesh.faces))
     welded, _, places, _ = mesh_topology.close_cracks(points, faces)
     part = mesh_topology.find_parts(welded, places)
     bodies, united = list[manifold3d.Manifold](), np.zeros(len(welded), dtype=bool)

@@ -19,6 +19,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import (
@@ -30,6 +31,7 @@ from invertwin.channel.beams.beam_tracing import (
 )
 from invertwin.channel.em import dielectric_solids, plane_waves
 from invertwin.channel.em import wedges as wedge_geometry
+from invertwin.channel.rays import edge_crossings
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.coplanar import refuse_coplanar_surfaces
 from invertwin.channel.rays.ray_scene import Occluders, is_visible
@@ -43,7 +45,7 @@ from invertwin.channel.rcs.moments.solver import Refusal, warn_not_solved
 from invertwin.channel.rcs.plate_diffraction import find_plates, trace_multiple_diffractions
 from invertwin.channel.rcs.shooting_bouncing_rays import find_illuminated_triangles, trace_tubes
 from invertwin.channel.rcs.surface_paths import face_path_lengths
-from invertwin.checks import is_differentiated
+from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.runtime.progress import track
@@ -129,7 +131,13 @@ class _FarFieldTarget:
         self,
     ) -> tuple[wedge_geometry.Wedges, Float64[Tensor, "row 3"], Float64[Tensor, "row 2"]]:
         """Pieces of sharp edges, their middles, and the widths of both faces across each [m]."""
-        pieces = _split_edges(self.sharp_edges, self.wavelength / _SEGMENTS_PER_WAVELENGTH)
+        # Edges end where they pass through surfaces.
+        edges, facets = self.sharp_edges, self.facets
+        with _DisableFuncTorch():  # discrete
+            fixed = wedge_geometry.Wedges(*map(strip_derivatives, vars(edges).values()))
+            met = edge_crossings.find_crossings(self.occluders, fixed, _EDGE_OFFSET * facets.size)
+        edges = edge_crossings.split_at_crossings(edges, met, facets.corners)
+        pieces = _split_edges(edges, self.wavelength / _SEGMENTS_PER_WAVELENGTH)
         middle, bodies = (pieces.start + pieces.end) / 2, (self.facets, self.occluders)
         sides = zip(pieces.faces.unbind(1), pieces.face_tangents.unbind(1), strict=True)
         widths = [face_path_lengths(*bodies, face, middle, inward) for face, inward in sides]
