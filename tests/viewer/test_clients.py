@@ -196,6 +196,27 @@ def test_what_is_no_message_is_none(raw):
     assert not is_valid_message(raw, {})
 
 
+def test_the_level_slider_hides_the_cells_below_it():
+    faces = np.array([[0, 1, 2]], np.int32)
+    names = [f"levels/{low} to {low + 10}" for low in (-50, -60, -70)]
+    bands = [DisplayLayer(n, "surface", np.eye(3, dtype=np.float32), faces) for n in names]
+    with Viewer(Display("map", bands), port=0) as made:
+        known = {x.label: x for x in made._server.gui._gui_input_handle_from_uuid.values()}
+        slider, box = known["lowest level"], known["levels"]
+
+        def shown() -> list[bool]:
+            return [made._nodes[name].visible for name in names]
+
+        assert [mark.label for mark in slider._impl.props._marks] == ["-70", "-60", "-50"]
+        assert shown() == [True] * 3
+        slider.value = 1
+        until(lambda: shown() == [True, True, False])
+        box.value = False
+        until(lambda: shown() == [False] * 3)
+        box.value = True
+        until(lambda: shown() == [True, True, False])
+
+
 def test_a_client_moves_the_slider(viewer):
     client = Client(viewer)
     client.look()

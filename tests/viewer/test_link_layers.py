@@ -45,8 +45,9 @@ def test_cells_are_in_the_band_of_their_level():
     levels = np.arange(32.0).reshape(plane.shape)
     levels[0, 0] = np.nan
     found = layers_of(floor(PerfectConductor()), RadioMap(plane, SETTINGS), levels)
-    bands = {name: layer for name, layer in found.items() if " to " in name}
-    assert len(bands) == 8
+    bands = {n.removeprefix("levels/"): x for n, x in found.items() if x.group == "levels"}
+    assert len(bands) == 12
+    assert next(iter(bands)).endswith(" to 31")  # the highest
     assert sum(len(layer.points) for layer in bands.values()) == 4 * 31
     centres = plane.centres.reshape(-1, 3).numpy()
     for name, layer in bands.items():

@@ -142,9 +142,7 @@ class SpectrumLoss:
 
     def _weight_power(self, ratio: Tensor) -> Tensor:
         """Weight power over its mean for gradients; plain speckle has weight one."""
-        if self.kind == "likelihood":
-            return ratio
-        return ratio * speckle_weight(ratio, self.degrees)
+        return ratio if self.kind == "likelihood" else ratio * speckle_weight(ratio, self.degrees)
 
     def __call__(self, simulated: _Map, measured: _Map) -> Float[Tensor, ""]:
         """Return the loss: 0 for equal maps, 1 for an empty simulated map under ``mse``.
@@ -361,9 +359,7 @@ class SpectrumLoss:
     def _subtract_background(self, power: Tensor) -> Tensor:
         if self.background == "level":
             return power - power.mean()
-        if self.background == "static":
-            return power - power.mean(0, keepdim=True)
-        return power
+        return power - power.mean(0, keepdim=True) if self.background == "static" else power
 
 
 class _ScalarWithGradient(torch.autograd.Function):

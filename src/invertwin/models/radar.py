@@ -21,12 +21,7 @@ from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.range_profile import beat_signal
 from invertwin.radar.signal.realisations import SpeckleRealisations
-from invertwin.radar.surrogate.surrogate import (
-    Surrogate,
-    deposit_targets,
-    resolve_surrogate,
-    surrogate_spectrum,
-)
+from invertwin.radar.surrogate import surrogate as surrogates
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
@@ -53,7 +48,7 @@ class SurrogateMap(ForwardModel):
     """
 
     grid: channel.Grid
-    surrogate: Surrogate | str = "response"
+    surrogate: surrogates.Surrogate | str = "response"
     sampling: channel.Sampling = channel.Sampling()
     coherent: Sequence[str] = ()
     stretch: Annotated[float, Ge(1)] = 1.0
@@ -62,7 +57,7 @@ class SurrogateMap(ForwardModel):
     )
 
     def __post_init__(self) -> None:
-        chosen = resolve_surrogate(self.surrogate)
+        chosen = surrogates.resolve_surrogate(self.surrogate)
         if chosen is None:
             raise InputError(
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
@@ -80,9 +75,9 @@ class SurrogateMap(ForwardModel):
             )
 
     @property
-    def kernels(self) -> Surrogate:
+    def kernels(self) -> surrogates.Surrogate:
         """The surrogate as a value."""
-        assert isinstance(self.surrogate, Surrogate)
+        assert isinstance(self.surrogate, surrogates.Surrogate)
         return self.surrogate
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
@@ -94,7 +89,7 @@ class SurrogateMap(ForwardModel):
             reference = (fixed, device.link())
         how: dict[str, Any] = {"sampling": self.sampling, "seed": seed, "scheme": scheme}
         how |= {"reference": reference, "coherent": self.coherent, "stretch": self.stretch}
-        return surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
+        return surrogates.surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(
         self, scenes: Sequence[Scene], sensor: Radar, seed: int
@@ -123,7 +118,9 @@ class SurrogateMap(ForwardModel):
         )
         if self.coherent:
             how = sensor, self.grid, self.kernels, self.sampling, self.coherent, self.stretch
-            targets = [torch.stack(deposit_targets(scene, *how)).sum(0) for scene in scenes]
+            targets = [
+                torch.stack(surrogates.deposit_targets(scene, *how)).sum(0) for scene in scenes
+            ]
             deposit = deposit + torch.stack(targets)
         spectra = self.kernels.shape(deposit.flatten(0, 1), sensor, self.grid)
         return spectra.clamp_min(0.0).reshape(deposit.shape)

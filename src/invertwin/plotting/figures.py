@@ -7,10 +7,15 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import same_color
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from numpy.typing import NDArray
 from torch import Tensor
 
+_INK = "#737b87"  # as far from white as from the dark pages
 PALETTE = ("#4c78a8", "#e0803c", "#54a24b", "#b279a2", "#9d755d")
 
 
@@ -76,11 +81,26 @@ def signed_colors(values: Iterable[Tensor], share: float) -> dict[str, Any]:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """The figure as a PNG file; equal figures give equal bytes."""
+    """The figure as a PNG file for light and dark pages: without a background, its black ink grey.
+
+    Equal figures give equal bytes.
+    """
     FigureCanvasAgg(figure)
+    for axes in figure.axes:
+        axes.tick_params(which="both", color=_INK, labelcolor=_INK)
+        axes.spines[:].set_color(_INK)
+    for artist in figure.findobj(lambda one: isinstance(one, Text | Line2D)):
+        if same_color(artist.get_color(), "black"):
+            artist.set_color(_INK)
+    # Black behind echoes stays.
+    for patch in [axes.patch for axes in figure.axes] + [
+        x.get_frame() for x in figure.findobj(Legend)
+    ]:
+        if same_color(patch.get_facecolor()[:3], "white"):
+            patch.set_facecolor("none")
     buffer = io.BytesIO()
     # No time stamp: a run that is repeated writes the same bytes.
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=110, facecolor="none", metadata={"Software": None})
     return buffer.getvalue()
 
 

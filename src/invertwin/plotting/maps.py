@@ -24,6 +24,7 @@ from invertwin.radar import DopplerMaps
 
 U_LABEL, V_LABEL = "direction cosine u (to the left)", "direction cosine v (up)"
 RATE_LABEL = "range rate [m/s], away > 0"
+_SIGNED_SHARE = 0.998  # of the bins have derivatives within the colours: a few may exceed them
 _MIN_POWER = 1e-30  # power that stands for none in dB
 _NOISE_MARGIN = 4.0  # power of an echo over the median of a map
 _RANGE_MARGIN = 4  # bins that are shown before and behind echoes
@@ -159,14 +160,15 @@ def gradient(
     cells[0].set_ylabel("range [m]", fontsize=8)
     if power is not None:
         _draw_decibels(figure, [(cells.pop(0), "power", first(power))], True, 30.0)
-    limit = max(_limit(panel) for panel in shared.values())
+    scale = signed_colors((panel.values for panel in shared.values()), _SIGNED_SHARE)
     images = [
-        _draw_signed(cell, title, panel, limit)
+        _draw_image(cell, title, panel, numbers(panel.values), **scale)
         for cell, (title, panel) in zip(cells, shared.items(), strict=False)
     ]
     add_colorbar(figure, images[-1], cells[: len(shared)], label)
     for cell, (title, panel) in zip(cells[len(shared) :], others.items(), strict=True):
-        image = _draw_signed(cell, title, panel, _limit(panel))
+        scale = signed_colors([panel.values], _SIGNED_SHARE)
+        image = _draw_image(cell, title, panel, numbers(panel.values), **scale)
         add_colorbar(figure, image, [cell], "own scale, same unit")
     return figure
 
@@ -190,7 +192,8 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     for cell, (across, label, dim) in zip(cells, views, strict=True):
         largest = residual.abs().argmax(dim, keepdim=True)
         panel = MapPanel(residual.gather(dim, largest).squeeze(dim), ranges, across, label)
-        image = _draw_signed(cell, "", panel, 2 * marked)
+        scale = {"vmin": -2 * marked, "vmax": 2 * marked, "cmap": "RdBu_r"}
+        image = _draw_image(cell, "", panel, numbers(panel.values), **scale)
         half = 0.5 * (bin_edges(ranges)[1] - bin_edges(ranges)[0]) / len(ranges)
         wide = 0.5 * (bin_edges(across)[1] - bin_edges(across)[0]) / len(across)
         for row, column in (panel.values.abs() > marked).nonzero().tolist():
@@ -250,17 +253,6 @@ def _crop_ranges(panels: list[tuple[Any, str, MapPanel]], dynamic_range: float) 
         if cell.get_subplotspec().is_first_col():
             whole = len(shown) == len(ranges)
             cell.set_ylabel("range [m]" if whole else label, fontsize=8)
-
-
-def _draw_signed(cell: Any, title: str, panel: MapPanel, limit: float) -> Any:
-    return _draw_image(
-        cell, title, panel, numbers(panel.values), vmin=-limit, vmax=limit, cmap="RdBu_r"
-    )
-
-
-def _limit(panel: MapPanel) -> float:
-    """The largest colour: a few outliers may exceed it."""
-    return float(np.quantile(np.abs(numbers(panel.values)), 0.998)) or 1.0
 
 
 def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style: Any) -> Any:

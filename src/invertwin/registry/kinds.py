@@ -397,9 +397,7 @@ class Registry:
             return list[self.run_file_type(arguments[0], name)]  # type: ignore[misc]
         if isinstance(origin, type) and issubclass(origin, Mapping):
             return dict[str, self.run_file_type(arguments[1], name)]  # type: ignore[misc]
-        if is_dataclass(hint) and isinstance(hint, type):
-            return _class_table(hint)
-        return hint
+        return _class_table(hint) if is_dataclass(hint) and isinstance(hint, type) else hint
 
     def convert_value(self, value: Any, hint: Any, name: str, given: Mapping[type, object]) -> Any:
         """Convert a value of the run file to the argument of the constructor.

@@ -239,6 +239,4 @@ def to_json_value(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if hasattr(value, "tolist"):
-        return to_json_value(value.tolist())
-    return str(value)
+    return to_json_value(value.tolist()) if hasattr(value, "tolist") else str(value)

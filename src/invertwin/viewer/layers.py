@@ -36,6 +36,8 @@ POSITION_LAYERS: dict[str, tuple[tuple[int, int, int], float]] = {
     BIN_POINTS: ((255, 220, 0), 1.5),
 }
 ELLIPSOID = "95 % ellipsoid"
+LEVELS = "levels"
+"""Group of the bands of a map of levels, each named by its lowest and its highest level."""
 _MAX_BEAMS, _MAX_BOARDS = 6, 64  # positions whose beams, and whose boards are drawn
 _BOARD_SIDE = 0.06  # of a board [m]
 _BOARD_SHARES = 0.04, 0.15  # of the beams: least and largest side of a drawn board

@@ -14,12 +14,12 @@ from invertwin.links import MapPlane, PropagationSettings, ReceiverPoints, Trans
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Scene
 from invertwin.viewer.display import DisplayLayer
-from invertwin.viewer.layers import ROLES, join_points, to_float32
+from invertwin.viewer.layers import LEVELS, ROLES, join_points, to_float32
 from invertwin.viewer.panels import POWER_COLORMAP
 
 _MAX_RECEIVERS = 4  # whose paths are drawn
 _RAYS = 100_000
-_LEVELS = 8  # bands of levels over a plane
+_BANDS = 12  # of levels over a plane
 _PATH_COLORS = ((40, 40, 40), (31, 119, 180), (44, 160, 44), (214, 39, 40), (148, 103, 189))
 
 
@@ -71,7 +71,7 @@ def _draw_paths(
 
 
 def _draw_levels(plane: MapPlane, levels: NDArray[np.float64]) -> list[DisplayLayer]:
-    """Cells of a plane in bands of as many cells, each of which can be hidden."""
+    """Cells of a plane in bands of as many cells, the highest first: a slider hides the lowest."""
     from matplotlib import colormaps
 
     flat, layers = levels.ravel(), list[DisplayLayer]()
@@ -79,14 +79,14 @@ def _draw_levels(plane: MapPlane, levels: NDArray[np.float64]) -> list[DisplayLa
     turns = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]).double()
     corners = to_float32(plane.centres.reshape(-1, 1, 3) + turns @ torch.stack(sides))
     known = np.isfinite(flat)
-    edges = np.quantile(flat[known], np.linspace(0, 1, _LEVELS + 1)) if known.any() else []
+    edges = np.quantile(flat[known], np.linspace(0, 1, _BANDS + 1)) if known.any() else []
     bands = np.digitize(flat, edges[1:-1])
     for band in np.unique(bands[known])[::-1]:
         own = corners[known & (bands == band)]
         faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(own))[:, None, None]
-        red, green, blue, _ = colormaps[POWER_COLORMAP](band / (_LEVELS - 1), bytes=True)
+        red, green, blue, _ = colormaps[POWER_COLORMAP](band / (_BANDS - 1), bytes=True)
         color = int(red), int(green), int(blue)
-        name = f"{edges[band]:.4g} to {edges[band + 1]:.4g}"
+        name = f"{LEVELS}/{edges[band]:.4g} to {edges[band + 1]:.4g}"
         triangles = faces.reshape(-1, 3).astype(np.int32)
         layers.append(DisplayLayer(name, "surface", own.reshape(-1, 3), triangles, color, 0.8))
     return layers

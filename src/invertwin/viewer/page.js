@@ -90,6 +90,8 @@
       if (!layer.shown) continue;
       const surface = layer.kind === "surface";
       if (layer.through) gl.disable(gl.DEPTH_TEST); else gl.enable(gl.DEPTH_TEST);
+      // From outside one sees into a room: the triangles of its walls face inwards.
+      if (layer.wall) gl.enable(gl.CULL_FACE); else gl.disable(gl.CULL_FACE);
       gl.uniform4f(uniform("color"), ...layer.color.map((x) => x / 255), layer.opacity);
       gl.uniform1i(uniform("lit"), surface);
       gl.uniform1f(uniform("size"), 5 * devicePixelRatio * (layer.size ?? 1));
@@ -251,7 +253,7 @@
     box.type = "checkbox";
     box.checked = layers.find((layer) => layer.group === group).shown;
     box.addEventListener("change", () => {
-      for (const layer of layers) if (layer.group === group) layer.shown = box.checked;
+      for (const layer of layers) if (layer.group === group) layer.shown = box.checked && !layer.hidden;
       draw();
     });
     label.append(box);
@@ -266,6 +268,22 @@
     label.append(` ${group} `);
     label.style = "display: inline-block; margin-right: 1em";
     part("layers").append(label);
+  }
+  // Bands of a map of levels come with the highest first; the slider hides the lowest.
+  const bands = layers.filter((layer) => layer.group === "levels").reverse();
+  if (bands.length > 1) {
+    const label = document.createElement("label"), slider = document.createElement("input"), said = document.createElement("output");
+    Object.assign(slider, { type: "range", min: 0, max: bands.length - 1, value: 0 });
+    const hide = () => {
+      const shown = bands.some((layer) => layer.shown);
+      bands.forEach((layer, k) => { layer.hidden = k < slider.value; layer.shown = shown && !layer.hidden; });
+      said.textContent = ` from ${bands[slider.value].name.split("/")[1].split(" ")[0]} up`;
+      draw();
+    };
+    slider.addEventListener("input", hide);
+    label.append("lowest level ", slider, said);
+    part("layers").append(label);
+    hide();
   }
 
   const move = (x, y) => {

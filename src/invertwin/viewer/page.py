@@ -26,6 +26,7 @@ from invertwin.viewer import panels
 from invertwin.viewer.display import Display, DisplayStep
 from invertwin.viewer.layers import ELLIPSOID, POSITION_LAYERS, SAMPLED_PATHS, to_float32
 from invertwin.viewer.link import InteractiveSensor
+from invertwin.viewer.surroundings import open_walls
 
 _MAX_MAPS = 144  # simulated ones of a page, over sensors, steps and positions
 _MAX_FRAMES = 8  # positions of a sensor
@@ -117,9 +118,7 @@ def _simulate_maps(display: Display, sensor: InteractiveSensor, frames: list[int
                 sensor.replace_meshes(step.bodies)
             maps = [sensor.predict_map(sensor.scene, frame).float() for frame in frames]
             found.append(torch.stack(maps))
-    if len(found) < max(1, len(display.steps)):
-        return None
-    return torch.stack(found)
+    return None if len(found) < max(1, len(display.steps)) else torch.stack(found)
 
 
 def _block_axis(centers: list[float], block: int) -> tuple[float, float]:
@@ -162,7 +161,7 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             simulates at every step, and says which points feed a bin. None shows what was
             measured alone.
     """
-    faces = {x.name: x.faces for x in display.layers}
+    faces, walls = {x.name: x.faces for x in display.layers}, open_walls(display)
 
     def pack_step(step: DisplayStep) -> dict[str, Any]:
         bodies = {
@@ -189,7 +188,8 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             # An ellipsoid is inside of its object, and seen through it.
             vars(layer)
             | {"group": layer.group, "through": layer.group == ELLIPSOID}
-            | _encode_mesh(layer.points, layer.faces)
+            | {"wall": layer.name in walls}
+            | _encode_mesh(layer.points, walls.get(layer.name, layer.faces))
             for layer in display.layers
         ],
         "steps": [pack_step(step) for step in kept],

@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -93,6 +92,7 @@ class Viewer:
         self._taken: int | None = None  # the step whose bodies the link has
         self._nodes: dict[str, Any] = {}
         self._labels: dict[str, Any] = {}
+        self._hidden: set[str] = set()  # bands below the lowest level
         self._walls = surroundings.open_walls(display)
         self._visible = display.groups | {x: x != SAMPLED_PATHS for x in POSITION_LAYERS if sensors}
         self._build_window()
@@ -172,15 +172,32 @@ class Viewer:
         gui.add_html(surroundings.legend_html(display))
         with gui.add_folder("layers", expand_by_default=len(self._visible) < _MANY_LAYERS):
             for group, shown in self._visible.items():
-                gui.add_checkbox(group, shown).on_update(partial(self._set_visibility, group))
+                gui.add_checkbox(group, shown).on_update(
+                    lambda event, group=group: self._set_visibility(group, event.target.value)
+                )
         self._said = gui.add_text("note", "", disabled=True, visible=False)
         for layer in display.layers:
             self._draw_layer(layer)
+        self._build_level_slider()
         surroundings.draw_ground(scene, display)
         surroundings.set_camera(self._server.initial_camera, display)
         self._server.on_client_connect(
             lambda client: surroundings.set_camera(client.camera, display, client.camera.aspect)
         )
+
+    def _build_level_slider(self) -> None:
+        """Let the person hide all cells below a level."""
+        bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS][::-1]
+        if len(bands) < 2:
+            return
+        lows = [(k, name.split("/")[1].split()[0]) for k, name in enumerate(bands)]
+        slider = self._server.gui.add_slider("lowest level", 0, len(bands) - 1, 1, 0, marks=lows)
+
+        def hide_lower(_: Any) -> None:
+            self._hidden = set(bands[: int(slider.value)])
+            self._set_visibility(layers.LEVELS, self._visible[layers.LEVELS])
+
+        slider.on_update(hide_lower)
 
     def _build_sensor_controls(self) -> None:
         gui, maps = self._server.gui, self._display.maps
@@ -228,11 +245,11 @@ class Viewer:
             slider.max, slider.value = max(1, len(axis) - 1), 0
         self._update_state(sensor=name, frame=0, bin=None)
 
-    def _set_visibility(self, group: str, event: Any) -> None:
-        self._visible[group] = bool(event.target.value)
+    def _set_visibility(self, group: str, shown: bool) -> None:
+        self._visible[group] = bool(shown)
         for name, node in list(self._nodes.items()):
             if name.split("/")[0] == group:
-                node.visible = self._visible[group]
+                node.visible = self._visible[group] and name not in self._hidden
 
     def _select_object(self, name: str) -> None:
         """Let the person move an object, from where the step has it."""

@@ -392,9 +392,7 @@ def phasor(phase: Tensor) -> Tensor:
     Args:
         phase: phases [rad], any shape, real or complex.
     """
-    if phase.is_complex():
-        return torch.exp(1j * phase)
-    return torch.complex(phase.cos(), phase.sin())
+    return torch.exp(1j * phase) if phase.is_complex() else torch.complex(phase.cos(), phase.sin())
 
 
 def area_vector(polygon: Float64[Tensor, "row corner 3"]) -> Float64[Tensor, "row 3"]:

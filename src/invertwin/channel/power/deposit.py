@@ -18,13 +18,9 @@ from torch._C import _DisableFuncTorch
 from invertwin.channel.em.depolarisation import polarisation_shares
 from invertwin.channel.paths import Grid, Link
 from invertwin.channel.power import bins, replay
+from invertwin.channel.power import trace as power_trace
 from invertwin.channel.power.clouds import deposit_density
 from invertwin.channel.power.integrand import DIFFERENTIABLE, from_table, to_table
-from invertwin.channel.power.trace import (
-    PowerTracer,
-    differentiable_tables,
-    strip_scene_derivatives,
-)
 from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
 from invertwin.channel.rays.batching import arrange_scenes
 from invertwin.channel.rays.scene_tables import Geometry, flatten, require_silhouette_samples
@@ -183,12 +179,12 @@ def _deposit_surfaces(
             surfaces = geometry.surfaces.scale(1 - share.loss * depolarisation)
             lossy = replace(geometry, surfaces=surfaces)
         with _DisableFuncTorch():
-            bare = strip_scene_derivatives(lossy, link)
-            trace = PowerTracer(
+            bare = power_trace.strip_scene_derivatives(lossy, link)
+            trace = power_trace.PowerTracer(
                 *bare, sampling, seed, scheme=scheme, reference=reference,
                 coupling=(share.odd, share.even), differentiate_antennas=antennas_move,
             )  # fmt: skip
-        tables = differentiable_tables(lossy, link)
+        tables = power_trace.differentiable_tables(lossy, link)
         layout = bins.BinLayout.from_link(grid, link)
         maps.append(_Deposit.apply(trace, layout, any(map(is_differentiated, tables)), *tables))
     return maps
@@ -214,7 +210,7 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        trace: PowerTracer, layout: bins.BinLayout, derivative: bool, *tables: Tensor
+        trace: power_trace.PowerTracer, layout: bins.BinLayout, derivative: bool, *tables: Tensor
     ) -> Tensor:
         out = bins.BinAccumulator(layout)
         trace.last_records = trace.deposit(out, record=derivative)
@@ -280,7 +276,7 @@ class _Linear(torch.autograd.Function):
 
 def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
     """Pull the gradient of the map back to some tables."""
-    trace: PowerTracer = ctx.trace
+    trace: power_trace.PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         tables = _attach_tables(trace, names)
         inputs = trace.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
@@ -305,7 +301,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
 
 def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
     """Push tangents of some tables forward to the map."""
-    trace: PowerTracer = ctx.trace
+    trace: power_trace.PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         given = dict(zip(names, tangents, strict=True))
         tables = _attach_tables(trace, names)
@@ -329,7 +325,7 @@ def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tenso
         return out.to_map()
 
 
-def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
+def _attach_tables(trace: power_trace.PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
     """Copy some of the kernel's tables and enable their derivatives."""
     tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))
@@ -337,6 +333,4 @@ def _attach_tables(trace: PowerTracer, names: Iterable[str]) -> dict[str, mit.Fl
 
 
 def _are_equal(first: Tensor | None, second: Tensor | None) -> bool:
-    if first is None or second is None:
-        return first is second
-    return torch.equal(first, second)
+    return first is second if first is None or second is None else torch.equal(first, second)

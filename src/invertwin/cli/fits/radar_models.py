@@ -127,9 +127,7 @@ def blur_end_step(run: RunFile) -> float | None:
     widened = kernels.range_width > 0 or kernels.angle_width > 0
     if own.model is not None and own.model.kind == "surrogate":
         widened |= own.model.stretch > 1
-    if others or kernels.exact or not widened:
-        return None
-    return settings.annealing * settings.steps
+    return None if others or kernels.exact or not widened else settings.annealing * settings.steps
 
 
 def make_sampling(run: RunFile) -> Sampling:

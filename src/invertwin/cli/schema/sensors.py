@@ -140,9 +140,7 @@ class RadarPoseTable(ConstructorTable):
         Args:
             radar: Radar at the poses.
         """
-        if self.range_center is None:
-            return radar
-        return radar.center_on(_float64(self.range_center))
+        return radar if self.range_center is None else radar.center_on(_float64(self.range_center))
 
 
 class RadarTable(RadarPoseTable):

@@ -203,9 +203,7 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
 
 def sample_interval(waveform: SampledWaveform) -> float:
     """Return the sampling interval [s]; 0 for simultaneous samples (OFDM)."""
-    if isinstance(waveform, FMCW | SteppedFrequency):
-        return float(waveform.sample_times[1])
-    return 0.0
+    return float(waveform.sample_times[1]) if isinstance(waveform, FMCW | SteppedFrequency) else 0.0
 
 
 @dataclass(frozen=True, eq=False)

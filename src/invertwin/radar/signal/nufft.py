@@ -96,9 +96,7 @@ def beat_of_delays(
         # The line is arbitrary, since the rest compensates it; so it needs no gradient.
         turns = ((cycles[-1] - cycles[0]) / (instants[-1] - instants[0])).detach()
     sums = NonUniformSum.apply(coefficient, cycles - place * turns, turns, samples, tolerance)
-    if count == 1:
-        return sums[0]
-    return (sums * _interpolation(samples, count).to(sums)).sum(0)
+    return sums[0] if count == 1 else (sums * _interpolation(samples, count).to(sums)).sum(0)
 
 
 def phase_cycles(
