@@ -96,7 +96,8 @@ class ChirpSettings:
                 f"expected a ramp of at least {last:g} s (ADC start and samples), got "
                 f"{self.ramp_end_time:g} s; lower samples or raise the sample rate"
             )
-        if len(self.channel_factors):
+        object.__setattr__(self, "channel_factors", tuple(self.channel_factors))
+        if self.channel_factors:
             do = "give (real, imaginary) for every receiver of every transmitter of the device"
             table = checked_tensor(self.channel_factors, (None, None, 2), "channel factors", do)
             if len(table) < max(order) or table.shape[1] < max(receivers):
@@ -109,11 +110,10 @@ class ChirpSettings:
     def correction(self) -> Complex[Tensor, "tx rx #sample"]:
         """Factors of beat signals that remove the errors of the channels and of range."""
         tx, rx = torch.tensor(self.transmit_order), torch.tensor(self.receivers)
-        ones = [[[1.0, 0.0]] * max(self.receivers)] * max(self.transmit_order)
+        ones = [[[1.0, 0.0]] * int(rx.max())] * int(tx.max())
         table = torch.tensor(self.channel_factors or ones, dtype=torch.float64)
-        factors = torch.view_as_complex(table)[tx - 1][:, rx - 1, None]
-        cycles = 2 * self.range_bias / SPEED_OF_LIGHT * self.waveform.frequencies
-        return factors * torch.exp(-2j * torch.pi * cycles)
+        phase = -4 * torch.pi * self.range_bias / SPEED_OF_LIGHT * self.waveform.frequencies
+        return torch.view_as_complex(table)[tx - 1][:, rx - 1, None] * torch.exp(1j * phase)
 
     @property
     def waveform(self) -> FMCW:
