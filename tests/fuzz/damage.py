@@ -420,6 +420,13 @@ def _mat(data: bytes) -> dict[str, Any]:
     return {name: value for name, value in found.items() if not name.startswith("__")}
 
 
+def _checkpoint(data: bytes) -> Any:
+    # As the library does: torch spends minutes on its message about names of a million letters.
+    if torch.serialization.get_unsafe_globals_in_checkpoint(io.BytesIO(data)):
+        raise ValueError("classes")
+    return torch.load(io.BytesIO(data), weights_only=True)
+
+
 _TREES: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     ".json": (json.loads, lambda tree: json.dumps(tree).encode()),
     ".gltf": (json.loads, lambda tree: json.dumps(tree).encode()),
@@ -427,7 +434,7 @@ _TREES: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     ".npz": (_npz, _saved(_save_npz)),
     ".mat": (_mat, _saved(scipy.io.savemat)),
     ".pt": (
-        lambda data: torch.load(io.BytesIO(data), weights_only=True),
+        _checkpoint,
         _saved(lambda file, state: torch.save(state, file)),
     ),
 }

@@ -46,7 +46,8 @@ def work(name: str, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
     form = FORMATS[name]
     samples = form.samples()
     for files in samples:  # what libraries load late is loaded before it is limited and watched
-        assert outcome(form, files)[0] is None
+        found, _ = outcome(form, files)
+        assert found is None, found
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + _SPACE, held + _SPACE))
     cases, slowest = 0, 0.0
