@@ -13,5 +13,4 @@ def derive_seed(seed: int, *key: int) -> int:
     Returns:
         A number in [0, 2³¹). It is the same on every machine.
     """
-    words = np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint32)
-    return int(words[0] >> 1)
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint32)[0] >> 1)

@@ -38,6 +38,7 @@ from invertwin.capture.readers.described_arrays import write_chirps
 from invertwin.cli.commands.check import run_check
 from invertwin.cli.run_file import load_run, to_toml
 from invertwin.cli.schema import build
+from invertwin.cli.schema.keys import json_schema
 from invertwin.datasets import SampleDataset
 from invertwin.datasets.shards import (
     FORMAT,
@@ -132,6 +133,7 @@ def _runs() -> list[Files]:
 
 def _old_runs() -> list[Files]:
     """Run files of the first frame, which `invertwin convert` reads."""
+    json_schema()  # kept on disk by the first who asks
     return [{"run.toml": files["run.toml"].replace(b"frame = 2", b"")} for files in _runs()]
 
 

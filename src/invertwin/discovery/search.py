@@ -138,8 +138,7 @@ class ShapeSearch:
         shapes = self.select_headings(self.select_kinds(shapes))
         shapes = self.split_shapes(self.merge_shapes(shapes))
         shapes, _ = self.fitted_frames.fit(shapes, _LONG_FIT_STEPS)
-        shapes = self.refine(self.select_heights(shapes))
-        return self.prune(shapes)
+        return self.prune(self.refine(self.select_heights(shapes)))
 
     def fit_spheres(self, places: Iterable[Tensor]) -> list[ShapeParameters]:
         """Fit small spheres at detections; the evidence supports those that are returned.

@@ -66,12 +66,9 @@ class Optimizer:
                 own = self.rotation_rate if name.endswith(_ANGLES) else None
                 found[parameter] = (rates or {}).get(parameter, own or self.rate)
         if self.kind == "gauss_newton":
+            every, radius = self.curvature_every, self.rate
             return GaussNewton(
-                modules,
-                objective,
-                trust_radius=self.rate,
-                trust_radii=found,
-                curvature_every=self.curvature_every,
+                modules, objective, trust_radius=radius, trust_radii=found, curvature_every=every
             )
         groups: dict[float, list[nn.Parameter]] = {}
         for parameter, rate in found.items():

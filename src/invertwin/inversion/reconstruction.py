@@ -178,16 +178,10 @@ def prepare_fit(
     modules, terms = _build_modules(scene, name_unknowns(parameters))
     of_sensors = [_build_modules(o.sensor, name_unknowns(o.parameters)) for o in observations]
     terms += [term for _, found in of_sensors for term in found]
-    return Fit(
-        scene,
-        observations,
-        list(modules.values()),
-        [list(found.values()) for found, _ in of_sensors],
-        stage=Stage(),
-        settings=FitSettings(loss, Optimizer(), (*regularizers, *terms), seed),
-        rates={},
-        stage_position=(0, 0, True),
-    )
+    own, others = list(modules.values()), [list(found.values()) for found, _ in of_sensors]
+    settings = FitSettings(loss, Optimizer(), (*regularizers, *terms), seed)
+    start: dict[str, Any] = {"stage": Stage(), "rates": {}, "stage_position": (0, 0, True)}
+    return Fit(scene, observations, own, others, settings=settings, **start)
 
 
 def _stage_observations(stage: Stage, observations: list[Observation]) -> list[Observation]:

@@ -108,19 +108,9 @@ class PropagationSettings:
             positions: Of the receivers [m].
             seed: Of the rays that find them.
         """
-        found = trace_paths(
-            scene,
-            sensor.positions,
-            positions,
-            self.frequency,
-            depth=self.depth,
-            edges=self.edges,
-            rays=self.rays,
-            seed=seed,
-        )
-        if not self.panels:
-            return found
-        return found + panel_paths(scene, self.panels, sensor.positions, positions, self.frequency)
+        link, rays = (sensor.positions, positions, self.frequency), self.rays
+        found = trace_paths(scene, *link, depth=self.depth, edges=self.edges, rays=rays, seed=seed)
+        return found + panel_paths(scene, self.panels, *link) if self.panels else found
 
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
@@ -223,17 +213,8 @@ class PropagationSettings:
         """
         if self.rough is None:
             return positions.new_zeros(len(sensor.positions), len(positions), 3)
-        return scattered_moments(
-            scene,
-            sensor,
-            self.receivers,
-            positions,
-            self.frequency,
-            self.rough,
-            seed,
-            depth=self.depth,
-            rays=self.rays,
-        )
+        link = scene, sensor, self.receivers, positions, self.frequency
+        return scattered_moments(*link, self.rough, seed, depth=self.depth, rays=self.rays)
 
     def frequency_responses(
         self,

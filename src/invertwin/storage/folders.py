@@ -204,8 +204,7 @@ def move_results(path: Path, manifest: Manifest) -> Manifest:
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(path / UNFINISHED / name, path / name)
     _remove(path, set(manifest.files).difference(results))
-    manifest = Manifest(digest=work.digest, files=results, unfinished=work)
-    return remove_unfinished(path, manifest)
+    return remove_unfinished(path, Manifest(digest=work.digest, files=results, unfinished=work))
 
 
 def remove_unfinished(path: Path, manifest: Manifest) -> Manifest:

@@ -382,7 +382,7 @@ def test_a_call_leaves_nothing_to_the_garbage_collector(monkeypatch):
             super().__init__(*given, **named)
             alive.append(weakref.ref(self))
 
-    monkeypatch.setattr("invertwin.channel.power.deposit.PowerTracer", Seen)
+    monkeypatch.setattr("invertwin.channel.power.trace.PowerTracer", Seen)
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     scene = Scene(
         {

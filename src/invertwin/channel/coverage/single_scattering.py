@@ -141,8 +141,7 @@ def trace_single_scattering(
     counts = len(stage.tx), len(stage.rx)
 
     def sum_links(pairs: ScatteredPairs) -> Tensor:
-        ends = pairs.outbound, pairs.inbound
-        amount = measure(*ends, pairs.depolarisation, stage.tx, stage.rx)
+        amount = measure(pairs.outbound, pairs.inbound, pairs.depolarisation, stage.tx, stage.rx)
         link = pairs.outbound.tx * counts[1] + pairs.inbound.tx
         total = torch.zeros(counts[0] * counts[1], value_count, dtype=torch.float64)
         return total.index_add(0, link, pairs.weight[:, None] * amount).unflatten(0, counts)

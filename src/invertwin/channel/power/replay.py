@@ -302,14 +302,9 @@ class _PendingVertex:
             return vertex, SurfaceInteraction(position, normal, face, None)
 
         previous, before = dr.if_stmt((number,), number > 0, read, skip, mode="symbolic")
-        return _VertexNeighbours(
-            self.vertex,
-            previous,
-            self.vertex.exists & self.following.exists,
-            self.interaction,
-            before,
-            self.next_position,
-        )
+        is_inner = self.vertex.exists & self.following.exists
+        here = self.interaction, before, self.next_position
+        return _VertexNeighbours(self.vertex, previous, is_inner, *here)
 
     def advance(self, inputs: Inputs, neighbours: _VertexNeighbours) -> _PendingVertex:
         """Add the gradient of ``following``, which is complete now, and move one vertex back.

@@ -200,8 +200,7 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         seen = labels.triangle_visibility(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
-    joints = joint_positions_at_start(own, begun)
-    objects = labels.object_labels(begun, seen, table.classes, joints)
+    objects = labels.object_labels(begun, seen, table.classes, joint_positions_at_start(own, begun))
     told = {"index": index, "objects": objects, "radar": labels.radar_labels(sensor.radar)}
     files = {f"{name}.npy": shards.npy_bytes(array) for name, array in arrays.items()}
     text = json.dumps(told, ensure_ascii=False, allow_nan=False)

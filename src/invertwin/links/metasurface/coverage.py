@@ -103,15 +103,8 @@ class Coverage:
             width: Added to the width over which shadows end on it [m].
             boundary: False leaves out of derivatives that shadows move.
         """
-        over = panel_response(
-            self.scene,
-            panel,
-            self.tx[None],
-            self.receivers,
-            self.frequency,
-            blur=width,
-            boundary=boundary,
-        )[0]
+        link = self.tx[None], self.receivers, self.frequency
+        over = panel_response(self.scene, panel, *link, blur=width, boundary=boundary)[0]
         return self.direct + over.real.square() + over.imag.square()
 
     def part(self, rows: Tensor | slice) -> "Coverage":

@@ -372,13 +372,9 @@ def articulated_template(
     sizes = [len(part.vertices) for part in parts]
     owner = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor(sizes))
     whole = concatenate_meshes(parts)
-    return BodyTemplate(
-        whole.vertices,
-        whole.faces,
-        torch.nn.functional.one_hot(owner, len(parts)).double(),
-        tuple(parents),
-        checked_tensor(joints, (len(parts), 3), "joints [m]", "give one per part"),
-    )
+    weights = torch.nn.functional.one_hot(owner, len(parts)).double()
+    places = checked_tensor(joints, (len(parts), 3), "joints [m]", "give one per part")
+    return BodyTemplate(whole.vertices, whole.faces, weights, tuple(parents), places)
 
 
 @safe_reader("a body model")

@@ -52,14 +52,8 @@ def person(height: float = 1.75, spacing: float = 0.03) -> BodyTemplate:
     names = list(_JOINTS)
     parents = [names.index(row["parent"]) if "parent" in row else -1 for row in _JOINTS.values()]
     joints = torch.tensor([row["place"] for row in _JOINTS.values()], dtype=torch.float64)
-    template = BodyTemplate(
-        mesh.vertices,
-        mesh.faces,
-        _weights(mesh.vertices),
-        tuple(parents),
-        joints,
-        names=tuple(names),
-    )
+    skin = mesh.vertices, mesh.faces, _weights(mesh.vertices)
+    template = BodyTemplate(*skin, tuple(parents), joints, names=tuple(names))
     return template.scale(tall / _DEFAULT_HEIGHT)
 
 

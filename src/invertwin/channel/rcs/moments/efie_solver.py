@@ -123,8 +123,7 @@ class _EFIEEquation:
         right = self._excitation(self.fixed_vertices, transmitters)
         inside = self._incident_fields(self.interior_points.detach(), transmitters)
         interior = torch.einsum("yn,yat->nat", self.interior_matrix.conj(), inside)
-        right = right + self.interior_weight * interior
-        return self._solve(right, adjoint=False)
+        return self._solve(right + self.interior_weight * interior, adjoint=False)
 
     def _solve(self, right: Tensor, *, adjoint: bool) -> Tensor:
         columns = right.flatten(1).to(self.factors.dtype)
