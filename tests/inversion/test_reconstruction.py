@@ -26,10 +26,10 @@ from invertwin.inversion import (
     reconstruct,
 )
 from invertwin.inversion.regularization import Laplacian
-from invertwin.models import radar as models
 from invertwin.models.radar import ExactMap
 from invertwin.radar import Surrogate
 from invertwin.radar.parameters import RadarPose, RangeBias
+from invertwin.radar.surrogate import surrogate as surrogates
 from invertwin.scene import Scene
 from invertwin.scene.parameters import Translation, Vertices
 from invertwin.seeds import derive_seed
@@ -48,13 +48,13 @@ def moved(fit: Reconstruction) -> torch.Tensor:
 def traced(monkeypatch) -> list[list[float]]:
     """Where the radar stands, along y, in every map that is predicted from now on."""
     seen: list[list[float]] = []
-    true = models.surrogate_spectrum
+    true = surrogates.surrogate_spectrum
 
     def spy(scene, radar, *rest, **options):
         seen.append(radar.positions[:, 1].tolist())
         return true(scene, radar, *rest, **options)
 
-    monkeypatch.setattr(models, "surrogate_spectrum", spy)
+    monkeypatch.setattr(surrogates, "surrogate_spectrum", spy)
     return seen
 
 
@@ -452,13 +452,13 @@ def test_bad_optimizers_are_named(options, message, unchecked):
 def test_widths_fall_to_the_exact_response(case, annealing, monkeypatch):
     """The last step has none of the extra width, even if all steps anneal."""
     kernels = []
-    original = models.surrogate_spectrum
+    original = surrogates.surrogate_spectrum
 
     def spied(scene, device, grid, kernel, **options):
         kernels.append(kernel)
         return original(scene, device, grid, kernel, **options)
 
-    monkeypatch.setattr(models, "surrogate_spectrum", spied)
+    monkeypatch.setattr(surrogates, "surrogate_spectrum", spied)
     fit(
         case.scene,
         case.radar,
