@@ -30,9 +30,7 @@ _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MAX_CRACK_SHARE = 1e-3  # of the edges on both sides: width of the widest cracks that are closed
 _MAX_OFFSET = 1e-7  # of welded vertices that need not move, relative to the size
 _MIN_PARALLEL_COSINE = 0.995  # of these edges
-_MAX_FOLD_COSINE = (
-    0.985  # of surfaces that go on across a crack: sheets that lie side by side do not
-)
+_MAX_FOLD_COSINE = 0.985  # of surfaces that go on across a crack, unlike sheets side by side
 
 
 class Cracks(NamedTuple):
