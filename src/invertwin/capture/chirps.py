@@ -74,7 +74,7 @@ class ChirpSettings:
     swap_iq: bool = False
     bits: Annotated[int, limits.AllowedValues((12, 14, 16))] = 16
     lanes: Annotated[int, limits.AllowedValues((2, 4))] | None = None
-    channel_factors: Sequence[Any] = ()
+    channel_factors: Sequence[Sequence[Sequence[float]]] = ()
     range_bias: Annotated[float, Ge(-limits.MAX_LENGTH), Le(limits.MAX_LENGTH)] = 0.0
 
     def __post_init__(self) -> None:
