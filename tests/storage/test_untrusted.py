@@ -5,6 +5,7 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 
 from invertwin.capture.channel_calibration import ChannelCalibration
 from invertwin.capture.readers import described_arrays
@@ -134,6 +135,14 @@ def test_an_archive_that_expands_beyond_reason_is_refused(tmp_path):
     assert file.stat().st_size < 2**20
     with pytest.raises(InputError, match=r"0.54 GB in zeros of a small file"):
         read_arrays(file, "make it again")
+
+
+def test_numbers_come_in_the_order_of_bytes_of_this_machine(tmp_path):
+    np.savez(tmp_path / "a.npz", big=np.arange(3, dtype=">f8"), text=np.array(["a"]))
+    found = read_arrays(tmp_path / "a.npz", "make it again")
+    assert found["big"].dtype.isnative
+    assert torch.from_numpy(found["big"]).tolist() == [0.0, 1.0, 2.0]
+    assert found["text"].tolist() == ["a"]
 
 
 def test_all_of_a_reader_is_wrapped():

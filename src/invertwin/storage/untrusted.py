@@ -221,7 +221,9 @@ def read_arrays(
                     raise ValueError(f"{entry.file_size / 1e9:.2g} GB in {name} of a small file")
                 with archive.open(entry) as opened:
                     _check_header(opened, entry.file_size)
-                    found[name] = np.load(opened, allow_pickle=False)
+                    held = np.load(opened, allow_pickle=False)
+                    # torch takes numbers in this machine's order of bytes only.
+                    found[name] = held.astype(held.dtype.newbyteorder("="), copy=False)
     return found
 
 
