@@ -143,6 +143,8 @@ def test_numbers_come_in_the_order_of_bytes_of_this_machine(tmp_path):
     assert found["big"].dtype.isnative
     assert torch.from_numpy(found["big"]).tolist() == [0.0, 1.0, 2.0]
     assert found["text"].tolist() == ["a"]
+    np.save(tmp_path / "a.npy", np.arange(3, dtype=">f8"))
+    assert torch.from_numpy(read_npy(tmp_path / "a.npy")).tolist() == [0.0, 1.0, 2.0]
 
 
 def test_all_of_a_reader_is_wrapped():

@@ -107,8 +107,8 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
             f"expected {what}, got no file {str(file)[:300]}; check the path"
         ) from None
     if not file.is_file() or not known.st_size:  # as those of /proc, which can block their reader
-        kind = "a folder" if file.is_dir() else "a pipe or a device"
-        kind = "an empty file" if file.is_file() else kind
+        other = "a folder" if file.is_dir() else "a pipe or a device"
+        kind = "an empty file" if file.is_file() else other
         raise InputError(f"expected {what}, got {kind}, {file}; name a file with data")
     if expands(known.st_size, 512 * getattr(known, "st_blocks", known.st_size)):
         raise InputError(
@@ -182,16 +182,13 @@ def read_npy(path: str | Path) -> "np.ndarray":
     Raises:
         InputError: No such file, a damaged one, or pickled objects.
     """
-    import numpy as np
-
     file = existing_file(path, "a NumPy file")
     # Opened here: numpy leaves a damaged file open.
     with (
         convert_read_errors(file, "plain numbers in a NumPy file (.npy)"),
         file.open("rb") as opened,
     ):
-        _check_header(opened, file.stat().st_size)
-        return np.load(opened, allow_pickle=False)
+        return _load_numbers(opened, file.stat().st_size)
 
 
 def read_arrays(
@@ -207,8 +204,6 @@ def read_arrays(
     Raises:
         InputError: No such file, a damaged one, or pickled objects.
     """
-    import numpy as np
-
     file = Path(path)
     if not file.is_file():
         raise InputError(f"expected {file.name} in {file.parent}, got no such file; {do}")
@@ -220,17 +215,15 @@ def read_arrays(
                 if expands(entry.file_size, entry.compress_size):
                     raise ValueError(f"{entry.file_size / 1e9:.2g} GB in {name} of a small file")
                 with archive.open(entry) as opened:
-                    _check_header(opened, entry.file_size)
-                    held = np.load(opened, allow_pickle=False)
-                    # torch takes numbers in this machine's order of bytes only.
-                    found[name] = held.astype(held.dtype.newbyteorder("="), copy=False)
+                    found[name] = _load_numbers(opened, entry.file_size)
     return found
 
 
-def _check_header(opened: Any, size: int) -> None:
-    """Raise ValueError where a header of NumPy asks for more memory than the file has numbers."""
+def _load_numbers(opened: Any, size: int) -> "np.ndarray":
+    """Load an array whose header asks for no more memory than the file has numbers."""
     from math import prod
 
+    import numpy as np
     from numpy.lib import format as npy
 
     version = npy.read_magic(opened)
@@ -241,3 +234,6 @@ def _check_header(opened: Any, size: int) -> None:
     if prod(shape) * kind.itemsize > size:
         raise ValueError(f"a header that says {shape} numbers of {kind}, more than the file holds")
     opened.seek(0)
+    held = np.load(opened, allow_pickle=False)
+    # torch takes numbers in this machine's order of bytes only.
+    return held.astype(held.dtype.newbyteorder("="), copy=False)

@@ -449,6 +449,5 @@ def shadow_speed(
         return stretch * (vector - ray * (dr.dot(normal, vector) * slope))
 
     tangent = dr.mulsign(dr.cross(normal, project_to_surface(edge)), samples.side * slope)
-    return surface_point.SurfacePoint(samples.face, b1, b2), dr.dot(
-        tangent, moving - material
-    ) * samples.weight
+    speed = dr.dot(tangent, moving - material) * samples.weight
+    return surface_point.SurfacePoint(samples.face, b1, b2), speed
