@@ -225,6 +225,20 @@ def test_a_client_moves_the_slider(viewer):
     client.close()
 
 
+def test_a_browser_that_leaves_at_once_raises_nothing(viewer):
+    client = Client(viewer)
+    client.look()
+    clients = viewer._server.get_clients
+    until(lambda: len(clients()) == 1)
+    (left,) = clients().values()
+    client.close()
+    until(lambda: not clients())
+    with pytest.raises(UserWarning, match="closed connection"):
+        left.camera.fov = 1.0
+    left._websock_connection.get_message_buffer()._warned_push_after_done = False
+    viewer._set_camera(left)
+
+
 @pytest.mark.slow
 def test_a_thousand_malformed_messages_end_nothing(sensing, capfd):
     from websockets.exceptions import ConnectionClosed

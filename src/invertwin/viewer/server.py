@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -181,9 +181,12 @@ class Viewer:
         self._build_level_slider()
         surroundings.draw_ground(scene, display)
         surroundings.set_camera(self._server.initial_camera, display)
-        self._server.on_client_connect(
-            lambda client: surroundings.set_camera(client.camera, display, client.camera.aspect)
-        )
+        self._server.on_client_connect(self._set_camera)
+
+    def _set_camera(self, client: Any) -> None:
+        """Frame the scene for the window of one browser."""
+        with suppress(UserWarning):  # viser's, of a browser that has left already
+            surroundings.set_camera(client.camera, self._display, client.camera.aspect)
 
     def _build_level_slider(self) -> None:
         """Let the person hide all cells below a level."""
