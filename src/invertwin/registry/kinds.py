@@ -502,7 +502,7 @@ def number_or_list(*kinds: Any) -> Any:
 
 
 def _union_type(kinds: Sequence[Any]) -> Any:
-    return Union.__getitem__(tuple(kinds))  # type: ignore[attr-defined]
+    return Union[tuple(kinds)]  # noqa: UP007 - of kinds that are known at run time
 
 
 def _union_members(hint: Any) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -72,7 +72,7 @@ def close_cracks(
     first = weld_vertices(places)
     welded = first[faces]
     edges, onto, open_edges, width = find_edges(welded, places, owner), first[:, None], 0, 0.0
-    offset = places[first]
+    offset = places.take(first, 0)
     offset -= places
     moves, share = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
     if (edges.counts == 1).any():
@@ -142,7 +142,7 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     along -= along.min()
     finest = 2 ** min(40, 63 - len(along).bit_length()) - 1
     order = sort_order((along * (finest / max(along.max(), 1.0))).astype(np.int64))
-    start = _find_runs([column[order] for column in places.T])
+    start = _find_runs([column.take(order) for column in places.T])
     lowest = order[start]
     pairs = _find_close_pairs(places[lowest], along[lowest])
     if len(pairs):
@@ -180,29 +180,23 @@ def _find_close_pairs(places: Points, along: Float64[np.ndarray, " v"]) -> Int64
 def sort_rows(
     *columns: Int64[np.ndarray, " n"], count: int
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " u"]]:
-    """Return the stable order of rows, and where in it runs of equal ones begin; in linear time.
+    """Return the stable order of rows, and where in it runs of equal ones begin.
 
     Args:
         columns: numbers of the rows, from 0, the first column counting most.
         count: more than all numbers.
     """
-    size = len(columns[0])
+    size, bits = len(columns[0]), count.bit_length()
     order = np.arange(size)
     if count == 1:
         return order, order[:1]
-    if count > 32 * size:
-        order = np.lexsort(columns[::-1])
-    else:
-        # Columns of a sparse matrix list their rows in order: a counting sort. Half the memory
-        # traffic in 32 bits.
-        kind = np.int32 if max(size, count) < 2**31 else np.int64
-        entries, ends = np.ones(size, dtype=bool), np.arange(size + 1, dtype=kind)
-        for column in reversed(columns):
-            first = column is columns[-1]
-            kept = (column if first else column[order]).astype(kind)
-            index = csr_array((entries, kept, ends), shape=(size, count)).tocsc().indices
-            order = index.astype(np.int64) if first else order[index]
-    return order, _find_runs([column[order] for column in columns])
+    held = max(1, (63 - size.bit_length()) // bits)  # columns that one number holds
+    for end in range(len(columns), 0, -held):
+        code, *rest = columns[max(0, end - held) : end]
+        for column in rest:
+            code = code << bits | column
+        order = order.take(sort_order(code.take(order)))
+    return order, _find_runs([column.take(order) for column in columns])
 
 
 def _find_runs(columns: Sequence[np.ndarray]) -> Int64[np.ndarray, " u"]:
@@ -244,7 +238,7 @@ def triangle_sides(faces: Int64[np.ndarray, "f 3"]) -> Int64[np.ndarray, "h 2"]:
     Args:
         faces: vertices of each triangle.
     """
-    return np.stack([faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()], 1)
+    return np.stack([faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()]).T
 
 
 def separate_groups(points: Points, groups: Groups) -> Points:
@@ -295,7 +289,7 @@ def find_edges(
         places: positions in units of the size of their group.
         owner: object of each triangle; repetitions in others count.
     """
-    whole = _sides_of(faces, np.flatnonzero(~find_slivers(places[faces])), len(places))
+    whole = _sides_of(faces, np.flatnonzero(~find_slivers(places.take(faces, 0))), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
     if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
         whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
@@ -321,7 +315,7 @@ def find_distinct_faces(
         places: positions in units of the size of their group.
         owner: object of each triangle.
     """
-    number = np.flatnonzero(~find_slivers(places[faces]))
+    number = np.flatnonzero(~find_slivers(places.take(faces, 0)))
     a, b, c = faces[number].T
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     body = np.broadcast_to(owner, len(faces))[number]
@@ -385,7 +379,8 @@ def _group_sides(
     low, high = (pick(*ends.T) for pick in (np.minimum, np.maximum))
     order, start = sort_rows(low, high, count=vertex_count)
     ends = np.stack([low[order[start]], high[order[start]]], 1)
-    return MeshEdges(ends, np.diff(start, append=len(order)), apex[order], triangle[order])
+    counts = np.diff(start, append=len(order))
+    return MeshEdges(ends, counts, apex.take(order), triangle.take(order))
 
 
 def find_slivers(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:

@@ -287,9 +287,9 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
     """
     if not len(positions):
         return np.zeros(0, dtype=np.int64)
-    cells = ((positions - positions.min(0)) / (np.ptp(positions) or 1.0) * 1023).astype(np.int64)
     bits = np.arange(1024)[:, None] >> np.arange(10) & 1
     spread = (bits << 3 * np.arange(10)).sum(1)  # two zeros between the bits of a number
-    x, y, z = spread[cells.T]
+    fine = 1023 / (np.ptp(positions) or 1.0)
+    x, y, z = (spread.take(((c - c.min()) * fine).astype(np.int64)) for c in positions.T)
     code = x << 2 | z << 1 | y  # boresight in the highest bits
     return mesh_topology.sort_order(code)
