@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from invertwin.errors import InputError
-from invertwin.storage.untrusted import expands
+from invertwin.storage.untrusted import numbers_expand
 
 if TYPE_CHECKING:  # a child process starts without what it does not need
     import numpy as np
@@ -195,7 +195,7 @@ def _hdf5(path: str, location: str, name: str = "") -> StoredArrays:
 def _check_size(path: str, name: str, held: Any) -> None:
     """Raise ValueError for many more numbers than a file of HDF5 has bytes."""
     count = getattr(held, "size", 0) or 0
-    if expands(16 * count, os.stat(path).st_size):  # none takes more than a complex one
+    if numbers_expand(count, path):
         raise ValueError(f"{count:.3g} numbers in {name} of a small file")
 
 

@@ -146,6 +146,16 @@ def expands(size: int, stored: int) -> bool:
     return size > max(_MAX_EXPANDED, _MAX_EXPANSION * stored)
 
 
+def numbers_expand(count: int, path: str | Path) -> bool:
+    """Return True if numbers, none wider than a complex one, need far more memory than their file.
+
+    Args:
+        count: Number of them in the file.
+        path: The file.
+    """
+    return expands(16 * count, Path(path).stat().st_size)
+
+
 def read_text(path: str | Path, what: str) -> str:
     """A file as text, without a byte-order mark.
 

@@ -296,8 +296,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         raise InputError(
             f"expected numbers in {path.name}, got {array.dtype}; name the variable of the samples"
         )
-    # Eight bytes or one in the file, every number becomes a complex one.
-    if untrusted.expands(16 * array.size, path.stat().st_size):
+    if untrusted.numbers_expand(array.size, path):
         what = f"{array.size:.3g} numbers in a file of {path.stat().st_size} bytes"
         raise InputError(f"expected recorded samples in {path.name}, got {what}; copy it again")
     return array
