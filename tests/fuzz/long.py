@@ -4,7 +4,9 @@
 
 Every format is read in turns by processes of their own, two at a time. `metrics.json` in DIR
 (default `out/fuzz`) counts `cases` and `failures`, in all and per format; the files of a failure
-are kept in DIR/<format>-<number>.
+are kept in DIR/<format>-<number>. Files that the libraries wrote are read in the process of the
+fuzz, those of users in a child: if the process dies of one, it is read again as a user's, and a
+failure if that fails too, else one of `deaths`.
 """
 
 import argparse
@@ -86,6 +88,26 @@ def work(name: str, seconds: float, seed: int, folder: Path) -> dict[str, Any]:
     return {"cases": cases, "slowest_seconds": slowest, "failures": kinds}
 
 
+def read_again(name: str, seed: int, edits: list[Any]) -> str | None:
+    """The fault of one case that is read as a user's, or None.
+
+    Args:
+        name: Of the format.
+        seed: First number of the case.
+        edits: Its second number, and its edits.
+    """
+    from fuzz.cases import outcome
+    from fuzz.damage import Edit, damaged
+    from fuzz.formats import FORMATS, SOUND
+
+    form = FORMATS[name]
+    case = (seed, edits[0], [Edit(**edit) for edit in edits[1]])
+    files = damaged(form.samples(), case, form.levels)
+    files.pop(SOUND, None)
+    found, _ = outcome(form, files)
+    return None if found is None else f"{found.what} at {found.where}"
+
+
 def turn(name: str, seconds: float, seed: int, out: Path) -> dict[str, Any]:
     """Cases of one format, in a process that may die of them."""
     folder = out / f"{name}-{seed}"
@@ -105,7 +127,10 @@ def turn(name: str, seconds: float, seed: int, out: Path) -> dict[str, Any]:
         kept = last.read_text() if last.exists() else ""  # empty, if it died of writing it
         cases, edits = json.loads(kept) if kept else (0, None)
         died = {"what": said or str(error)[-200:], "count": 1, "edits": [edits]}
-        found = {"cases": cases + 1, "slowest_seconds": 0.0, "failures": {"died": died}}
+        again = edits and [*call[:3], "--again", json.dumps(edits), "--work", name]
+        passes = again and not subprocess.run(again, env=environment, timeout=_LATE).returncode
+        found = {"cases": cases + 1, "slowest_seconds": 0.0, "deaths": int(bool(passes))}
+        found["failures"] = {} if passes else {"died": died}
     (folder / "case.json").unlink(missing_ok=True)
     folder.rmdir()
     return found
@@ -117,7 +142,8 @@ def measure(minutes: float, seed: int, out: Path, only: list[str]) -> dict[str, 
 
     names = only or list(FORMATS)
     found: dict[str, Any] = {
-        name: {"cases": 0, "failures": 0, "slowest_seconds": 0.0, "kinds": {}} for name in names
+        name: {"cases": 0, "failures": 0, "deaths": 0, "slowest_seconds": 0.0, "kinds": {}}
+        for name in names
     }
     seeds = random.Random(seed)
     turns = max(1, round(2 * 60 * minutes / len(names) / TURN))
@@ -127,6 +153,7 @@ def measure(minutes: float, seed: int, out: Path, only: list[str]) -> dict[str, 
         part = turn(name, seconds, seeds.randrange(2**31), out)
         row = found[name]
         row["cases"] += part["cases"]
+        row["deaths"] += part.get("deaths", 0)
         row["slowest_seconds"] = max(row["slowest_seconds"], part["slowest_seconds"])
         for key, kind in part["failures"].items():
             known = row["kinds"].setdefault(key, {"what": kind["what"], "count": 0, "edits": []})
@@ -139,6 +166,7 @@ def measure(minutes: float, seed: int, out: Path, only: list[str]) -> dict[str, 
     return {
         "cases": sum(row["cases"] for row in found.values()),
         "failures": sum(row["failures"] for row in found.values()),
+        "deaths": sum(row["deaths"] for row in found.values()),
         "minutes": minutes,
         "seed": seed,
         "formats": found,
@@ -153,7 +181,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="*", default=[], help="names of formats")
     parser.add_argument("--work", help=argparse.SUPPRESS)
+    parser.add_argument("--again", type=json.loads, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.again:
+        sys.exit(read_again(given.work, given.again[0], given.again[1:]))
     if given.work:
         print(json.dumps(work(given.work, 60 * given.minutes, given.seed, given.out)))
         return
@@ -165,6 +196,8 @@ def main() -> None:
         for key, kind in row["kinds"].items():
             print(f"    {kind['count']:5} × {key}: {kind['what']}")
     print(f"{metrics['cases']} cases, {metrics['failures']} failures")
+    if metrics["deaths"]:
+        print(f"{metrics['deaths']} × the process died of a file that is read well as a user's")
     path = given.out / "metrics.json"
     path.write_text(json.dumps(metrics, indent=2) + "\n")
     print(f"wrote {path}")

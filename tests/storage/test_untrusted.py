@@ -275,3 +275,10 @@ def test_meshes_of_a_scene_file_lie_beside_it(tmp_path):
     (tmp_path / "set" / "a.xml").write_text(text.format("../a.ply") + "</shape></scene>")
     with pytest.raises(InputError, match=r"got '\.\./a\.ply', which is elsewhere"):
         load_scene_xml(tmp_path / "set" / "a.xml")
+
+
+@pytest.mark.parametrize("content", [(1,), {1}, torch.zeros(2), np.zeros(2), 1j, bytearray(b"x")])
+def test_a_value_of_another_kind_is_a_fault_of_the_file(tmp_path, content):
+    said = pytest.raises(InputError, match=r"expected a fit, got .*no attribute 'items'")
+    with said, convert_read_errors(tmp_path / "a.pt", "a fit"):
+        exec("content.items()", {"__name__": "invertwin.reader", "content": content})

@@ -22,8 +22,8 @@ _R = TypeVar("_R")
 # Bytes of a file or an array, and over those that it takes on disk: more is a bomb.
 _MAX_EXPANDED, _MAX_EXPANSION = 2**28, 100
 _MAX_TEXT = 2**28  # bytes
-_PLAIN = (str, bytes, int, float, list, dict, type(None))
-_PLAIN_MODULES = ("decimal", "datetime", "numpy")
+_PLAIN = (str, bytes, bytearray, int, float, complex, list, tuple, set, dict, type(None))
+_PLAIN_MODULES = ("decimal", "datetime", "numpy", "torch")
 _OWN_FAULTS = (NameError, AttributeError, ImportError, NotImplementedError, AssertionError)
 _DAMAGED_ADVICE = "it is damaged or of another kind; copy or export it again"
 
