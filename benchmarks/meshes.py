@@ -126,7 +126,8 @@ def meshes() -> dict[str, Parts]:
     corners = clean.vertices[clean.faces].reshape(-1, 3)
     triples = torch.arange(len(corners)).reshape(-1, 3)
     random = torch.randn(corners.shape, generator=torch.Generator().manual_seed(0)).double()
-    away = torch.nn.functional.normalize(random, dim=1)
+    away = 0.5e-5 * float(vector(*SIZE).norm()) * torch.nn.functional.normalize(random, dim=1)
+    shaken = [Mesh(p.vertices + away[4 * k : 4 * k + 4], p.faces) for k, p in enumerate(plates())]
     flipped = clean.faces.clone()
     flipped[::3] = flipped[::3].flip(1)
     front = clean.faces[8:10]
@@ -154,7 +155,8 @@ def meshes() -> dict[str, Parts]:
         "mixed": [Mesh(clean.vertices, flipped)],
         "cracked": [merge_meshes(crack)],
         "soup": [Mesh(corners.float().double(), triples)],
-        "jittered": [Mesh(corners + 0.5e-5 * float(vector(*SIZE).norm()) * away, triples)],
+        "jittered": [Mesh(corners + away, triples)],
+        "shaken panels": shaken,
     }
 
 

@@ -71,7 +71,9 @@ def close_cracks(
     places = separate_groups(points, groups)
     first = weld_vertices(places)
     welded = first[faces]
-    edges, onto, open_edges, width = find_edges(welded, places, owner), first[:, None], 0, 0.0
+    # A vertex beside the end of an edge moves there, rather than to cut a short piece off.
+    edges = find_edges(welded, places, owner, CRACK_TOLERANCE)
+    onto, open_edges, width = first[:, None], 0, 0.0
     offset = places.take(first, 0)
     offset -= places
     moves, share = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
@@ -86,6 +88,8 @@ def close_cracks(
     if (ends != first[vertex, None]).any():
         welded = weld_vertices(places)[faces]
         edges = find_edges(welded, places, owner)
+    elif (edges.counts == 1).any():
+        edges = _split_at_vertices(edges, places)
     return welded, edges, places, Cracks(vertex, ends, share, open_edges, width)
 
 
@@ -277,7 +281,10 @@ class MeshEdges(NamedTuple):
 
 
 def find_edges(
-    faces: Int64[np.ndarray, "f 3"], places: Points, owner: Int64[np.ndarray, " f"] | int = 0
+    faces: Int64[np.ndarray, "f 3"],
+    places: Points,
+    owner: Int64[np.ndarray, " f"] | int = 0,
+    shortest: float = 0.0,
 ) -> MeshEdges:
     """Find the edges of triangles.
 
@@ -288,12 +295,13 @@ def find_edges(
         faces: welded vertices of each triangle.
         places: positions in units of the size of their group.
         owner: object of each triangle; repetitions in others count.
+        shortest: vertices that are no further from an end of the side do not divide it.
     """
     whole = _sides_of(faces, np.flatnonzero(~find_slivers(places.take(faces, 0))), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
     if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
         whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
-    return _split_at_vertices(whole, places)
+    return _split_at_vertices(whole, places, shortest)
 
 
 def _sides_of(
@@ -398,8 +406,8 @@ def find_slivers(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"
     return square * across - common**2 <= WELD_TOLERANCE**2 * longest
 
 
-def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
-    """Split edges at the vertices of others that lie on them."""
+def _split_at_vertices(edges: MeshEdges, places: Points, shortest: float = 0.0) -> MeshEdges:
+    """Split edges at the vertices of others that lie on them, into pieces that are not shorter."""
     # Two triangles complete an edge, except where another part of the mesh touches it.
     candidates = edges.counts != 2
     pairs = _pairs_at_edges(edges, edges.triangle)
@@ -411,6 +419,8 @@ def _split_at_vertices(edges: MeshEdges, places: Points) -> MeshEdges:
     ends = edges.ends[rows]
     row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places)
     inner = (vertex[:, None] != ends[row]).all(1)
+    gap = np.linalg.norm(places[vertex, None] - places[ends[row]], axis=2).min(1)
+    inner &= gap > shortest
     if not inner.any():
         return edges
     order = np.flatnonzero(inner)[np.lexsort((share[inner], row[inner]))]

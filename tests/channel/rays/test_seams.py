@@ -264,6 +264,29 @@ def test_panels_that_move_apart_are_not_one_surface():
             assert find_rigid_groups(faces, rest).tolist() == groups
 
 
+@pytest.mark.parametrize("share", [1e-7, 1e-5, 4e-5])
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_panels_across_cracks_are_one_surface_while_they_turn_together(share, mode):
+    """Both sides of a crack turn at different radii; an exact comparison counted both twice."""
+    faces, points, parts = panels()
+    generator = torch.Generator().manual_seed(5)
+    size = float(float64(0.4, 0.5, 0.3).norm())
+    points = [
+        own + 0.5 * share * size * torch.randn(own.shape, generator=generator).double().sign()
+        for own in points
+    ]
+    with forward_ad.dual_level():
+        angle = torch.zeros((), dtype=torch.float64, requires_grad=mode == "reverse")
+        if mode == "forward":
+            angle = forward_ad.make_dual(angle, torch.ones_like(angle))
+        turned = [own @ rotation_from_vector(angle * float64(1, 2, 3)).T for own in points]
+        assert find_rigid_groups(faces, turned).tolist() == [0] * 6
+        assert (topology_of(parts, turned).edge_faces >= 0).all()
+        lid = [own + (k == 2) * angle * float64(0, 0, 0.02) for k, own in enumerate(turned)]
+        groups = find_rigid_groups(faces, lid).tolist()
+        assert [k for k in range(6) if groups.count(groups[k]) == 1] == [2]
+
+
 def test_poses_of_their_own_are_several_parameters():
     """One tensor holds all of them, so that the leaves of the graph are the same."""
     shifts = torch.zeros(6, 3, dtype=torch.float64, requires_grad=True)

@@ -23,6 +23,7 @@ from invertwin.scene import mesh_topology
 Contacts = Float64[Tensor, "n 4"]
 _MAX_CACHED_PAIRS = 10_000
 _SAME_MOTION = 1e-9  # relative difference of velocities that count as one
+_TURN = 20.0  # the same over the relative width of a crack, whose sides turn at different radii
 _SAME_PLACE = 1e-9  # relative distance of points that count as one
 #: By numbers and faces of two objects, since several may share their faces: the faces, whose ids
 #: stay theirs, all points, and the contacts.
@@ -36,8 +37,8 @@ def find_rigid_groups(
 ) -> Int64[np.ndarray, " object"]:
     """Return the group of each object, numbered from 0 in the order of the objects.
 
-    Two objects are in one group if vertices of one lie on edges of the other, and all of these
-    points keep together: both at rest, or with equal derivatives.
+    Two objects are in one group if vertices of one lie on edges of the other, or across a crack
+    that is closed, and all of these points keep together: both at rest, or with equal derivatives.
 
     Args:
         faces: triangles of each object.
@@ -48,7 +49,8 @@ def find_rigid_groups(
     moves = np.array([is_differentiated(points) for points in vertices])
     start, points = np.cumsum([0, *map(len, fixed)])[:-1], torch.cat(fixed).numpy()
     low, high = (f.reduceat(points, start) for f in (np.minimum, np.maximum))
-    reach = mesh_topology.WELD_TOLERANCE * np.linalg.norm(high - low, axis=1)[:, None]
+    size = np.linalg.norm(high - low, axis=1)
+    reach = mesh_topology.CRACK_TOLERANCE * size[:, None]
     near = mesh_topology.overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
@@ -58,7 +60,9 @@ def find_rigid_groups(
         contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b]))
         if len(contacts) > 1:
             pairs.append((a, b))
-            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()]
+            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()] / max(
+                size[[a, b]]
+            )
             gaps.append((points[:, 0], torch.lerp(points[:, 1], points[:, 2], contacts[:, 3:])))
     # One comparison for all pairs, as a rule; else one for each.
     if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
@@ -86,7 +90,7 @@ def _find_contacts(
     low = torch.maximum(points[0].amin(0), points[1].amin(0))
     high = torch.minimum(points[0].amax(0), points[1].amax(0))
     size = float((both.amax(0) - both.amin(0)).norm())
-    margin = mesh_topology.WELD_TOLERANCE * size
+    margin = mesh_topology.CRACK_TOLERANCE * size
     places = (both / size).numpy()
     edges = []
     for number, (triangles, offset) in enumerate(zip(faces, (0, len(points[0])), strict=True)):
@@ -97,7 +101,7 @@ def _find_contacts(
     parts = []
     for own, other in ((0, 1), (1, 0)):
         row, vertex, share = mesh_topology.find_vertices_on_edges(
-            edges[own], np.unique(edges[other]), places
+            edges[own], np.unique(edges[other]), places, mesh_topology.CRACK_TOLERANCE
         )
         parts.append(np.column_stack([vertex, edges[own][row], share]))
     found = torch.from_numpy(np.concatenate(parts).astype(np.float64))
@@ -121,21 +125,25 @@ def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"])
 
 
 def _move_as_one(first: Float64[Tensor, "n 3"], second: Float64[Tensor, "n 3"]) -> bool:
-    """Test whether points in one place have the same derivatives, if any."""
+    """Test whether points in one place have the same derivatives, if any.
+
+    Args:
+        first, second: positions over the size of their objects, up to a crack apart.
+    """
     if not is_differentiated(first) and not is_differentiated(second):
         return True
+    width = float((strip_derivatives(first) - strip_derivatives(second)).abs().amax())
     pair = [forward_ad.unpack_dual(points).tangent for points in (first, second)]
-    if any(tangent is not None for tangent in pair):
-        rates = [torch.zeros_like(first) if rate is None else rate for rate in pair]
-        return _are_close(*map(strip_derivatives, rates))
-    return _have_one_gradient(first, second)
+    slopes = [torch.zeros_like(first) if rate is None else rate for rate in pair]
+    if all(rate is None for rate in pair):
+        slopes = _random_gradients(first, second)
+    one, other = map(strip_derivatives, slopes)
+    largest = torch.maximum(one.abs().amax(), other.abs().amax())
+    return bool((one - other).abs().amax() <= (_SAME_MOTION + _TURN * width) * largest)
 
 
-def _have_one_gradient(first: Tensor, second: Tensor) -> bool:
-    """Test whether rows that are equal have the same derivative in every leaf of their graph.
-
-    One random combination of all rows decides.
-    """
+def _random_gradients(first: Tensor, second: Tensor) -> list[Tensor]:
+    """Return the gradient of one random combination of all rows in every leaf of their graph."""
     generator = torch.Generator().manual_seed(0)
     weight = torch.rand(first.shape, dtype=torch.float64, generator=generator) + 0.5
     leaves, seen, nodes = list[Tensor](), set[Any](), [first.grad_fn, second.grad_fn]
@@ -153,9 +161,4 @@ def _have_one_gradient(first: Tensor, second: Tensor) -> bool:
         )
         for points in (first, second)
     ]
-    return _are_close(*(torch.cat([part.flatten() for part in parts]) for parts in slopes))
-
-
-def _are_close(first: Tensor, second: Tensor) -> bool:
-    largest = float(torch.cat([first, second]).abs().amax())
-    return float((first - second).abs().amax()) <= _SAME_MOTION * largest
+    return [torch.cat([part.flatten() for part in parts]) for parts in slopes]
