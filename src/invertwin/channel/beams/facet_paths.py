@@ -13,13 +13,8 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.beams.beam_tracing import (
-    MAX_FACETS_BEAM_TRACING,
-    Facets,
-    IlluminatedPatches,
-    build_facets,
-    trace_beams,
-)
+from invertwin.channel.beams import beam_tracing
+from invertwin.channel.beams.beam_tracing import IlluminatedPatches, trace_beams
 from invertwin.channel.em import antenna_fields as antennas
 from invertwin.channel.em.plane_waves import area_vector, dot, polygon_integral
 from invertwin.channel.paths import Link, Paths, concatenate_paths
@@ -80,24 +75,24 @@ class _Unfolding(NamedTuple):
     translation: Float64[Tensor, "row 3"]
 
 
-def _conductor_facets(scene: Scene, link: Link) -> Facets:
+def _conductor_facets(scene: Scene, link: Link) -> beam_tracing.Facets:
     geometry = flatten(scene, link.wavelength)
     if not all(geometry.coherent):
         raise InputError(
             "expected smooth conductors alone for facet paths, got others; give a "
             "PerfectConductor, or use power paths"
         )
-    if len(geometry.faces) > MAX_FACETS_BEAM_TRACING:
+    if len(geometry.faces) > beam_tracing.MAX_FACETS_BEAM_TRACING:
         raise InputError(
-            f"expected at most {MAX_FACETS_BEAM_TRACING} triangles for facet paths, got "
-            f"{len(geometry.faces)}; use power paths, or simulate"
+            f"expected at most {beam_tracing.MAX_FACETS_BEAM_TRACING} triangles for facet paths, "
+            f"got {len(geometry.faces)}; use power paths, or simulate"
         )
     require_single_surfaces(scene)
     viewers = torch.cat([link.tx, link.rx])
     with tracing():
         rays = RayScene(geometry, link)
         refuse_coplanar_surfaces(rays, geometry.vertices, viewers, geometry.names)
-    return build_facets(geometry.vertices, geometry.topology)
+    return beam_tracing.build_facets(geometry.vertices, geometry.topology)
 
 
 def _unfold_reflections(

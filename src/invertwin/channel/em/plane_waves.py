@@ -119,6 +119,26 @@ def reflect_field(
     return reflected * attenuation[:, None, None]
 
 
+def scatter_from_metal(
+    normal: Vectors,
+    direction: Vectors,
+    field: Float64[Tensor, "row 2 3"],
+    received: Float64[Tensor, "row 2 3"],
+) -> tuple[Complex128[Tensor, "row 2 2"], Float64[Tensor, "row 2 3"]]:
+    """Amplitudes S per m² and unit wave number of smooth metal, and its reflected field.
+
+    With F of ``radiate_field`` for a conductor, p·F = −(jk/2π)[(p·d)(n·E) − (p·E)(n·d)].
+
+    Args:
+        normal, direction, field: as in ``reflect_field``, the field real.
+        received: receiving polarisations p, transverse to the direction towards the receiver.
+    """
+    across = dot(normal[:, None], field)
+    tangential = dot(received[:, :, None], field[:, None]) * dot(normal, direction)[:, None, None]
+    amplitude = dot(received, direction[:, None])[..., None] * across[:, None] - tangential
+    return amplitude * (-0.5j / math.pi), 2 * across[..., None] * normal[:, None] - field
+
+
 def radiate_field(
     interfaces: SmoothInterfaces,
     wave_number: float,

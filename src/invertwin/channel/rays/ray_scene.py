@@ -141,8 +141,8 @@ class Occluders:
 
     def to_local_points(self, points: Float64[Tensor, "n 3"]) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""
-        local = (points.detach() - self.origin).to(torch.float32)
-        return mi.Point3f(*(arrays.to_float(local[:, k]) for k in range(3)))
+        pairs = zip(points.detach().unbind(1), self.origin, strict=True)
+        return mi.Point3f(*(arrays.to_float(column - start) for column, start in pairs))
 
 
 class RayScene(Occluders):

@@ -13,17 +13,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.beams.beam_tracing import IlluminatedPatches
+from invertwin.channel.em import plane_waves
 from invertwin.channel.em.dielectric_solids import DielectricSolids, normal_component
 from invertwin.channel.em.plane_waves import (
-    SmoothInterfaces,
-    Vectors,
     area_vector,
     cross,
     dot,
     project_transverse,
-    radiate_currents,
     radiate_field,
-    reflect_field,
     roughness_attenuation,
 )
 from invertwin.scene.material.fresnel import refractive_index
@@ -60,7 +57,7 @@ class InterfaceFields(NamedTuple):
 def apply_fresnel(
     permittivity_in: Complex128[Tensor, " row"],
     permittivity_out: Complex128[Tensor, " row"],
-    normal: Vectors,
+    normal: plane_waves.Vectors,
     wave_vector: Tensor,
     field: Complex128[Tensor, "row 2 3"],
 ) -> InterfaceCoefficients:
@@ -96,11 +93,11 @@ def apply_fresnel(
 
 def scatter_at_interfaces(
     solids: DielectricSolids,
-    interfaces: SmoothInterfaces,
+    interfaces: plane_waves.SmoothInterfaces,
     wave_number: float,
     patches: IlluminatedPatches,
     field: Complex128[Tensor, "row 2 3"],
-    scattering_direction: Vectors,
+    scattering_direction: plane_waves.Vectors,
 ) -> InterfaceFields:
     """Compute radiated, reflected and transmitted fields at surfaces, from outside or inside.
 
@@ -125,7 +122,7 @@ def scatter_at_interfaces(
     waves = patches.normal[rows], patches.direction[rows], field[rows]
     front = interfaces.rows(rows), wave_number, *waves
     radiated = radiated.index_copy(0, rows, radiate_field(*front, scattering_direction[rows]))
-    reflected = reflected.index_copy(0, rows, reflect_field(*front))
+    reflected = reflected.index_copy(0, rows, plane_waves.reflect_field(*front))
     rows = torch.nonzero(~outside & conducting)[:, 0]
     n = patches.normal[rows, None]
     reflected = reflected.index_copy(0, rows, 2 * dot(n, field[rows])[..., None] * n - field[rows])
@@ -137,7 +134,7 @@ def scatter_at_interfaces(
     inner, onward = _refract_at_faces(solids, interfaces, wave_number, patches, field, rows)
     n, s, wave = patches.normal[rows], scattering_direction[rows], patches.wave_vector[rows]
     roughness = interfaces.rows(rows)
-    outer = radiate_currents(wave_number, -n, wave, field[rows], inner, s)
+    outer = plane_waves.radiate_currents(wave_number, -n, wave, field[rows], inner, s)
     p = -dot(wave, n).real
     cosines = p + dot(n, s), 2 * p
     losses = [roughness_attenuation(roughness, wave_number, cosine) for cosine in cosines]
@@ -181,7 +178,7 @@ def _straighten_waves(
 
 def _refract_at_faces(
     solids: DielectricSolids,
-    interfaces: SmoothInterfaces,
+    interfaces: plane_waves.SmoothInterfaces,
     wave_number: float,
     patches: IlluminatedPatches,
     field: Tensor,

@@ -22,13 +22,8 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
-from invertwin.channel.beams.beam_tracing import (
-    MAX_FACETS_BEAM_TRACING,
-    Facets,
-    IlluminatedPatches,
-    build_facets,
-    trace_beams,
-)
+from invertwin.channel.beams import beam_tracing
+from invertwin.channel.beams.beam_tracing import MAX_FACETS_BEAM_TRACING, IlluminatedPatches
 from invertwin.channel.em import dielectric_solids, plane_waves
 from invertwin.channel.em import wedges as wedge_geometry
 from invertwin.channel.rays import edge_crossings
@@ -48,6 +43,7 @@ from invertwin.channel.rcs.surface_paths import face_path_lengths
 from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.runtime.progress import track
 from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
@@ -82,7 +78,7 @@ class _FarFieldTarget:
         interiors: dielectric solids, each with the indices of its frequencies.
     """
 
-    facets: Facets
+    facets: beam_tracing.Facets
     topology: Topology
     vertices: Float64[Tensor, "v 3"]
     occluders: Occluders
@@ -218,7 +214,8 @@ def trace_far_field(
         if receivers is not None:
             antenna_pairs.append((receivers, transmitters))
         tracers = [_FarFieldTracer(target, *pair) for pair in antenna_pairs]
-        found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
+        with torch_threads(1):  # many small operations between rays
+            found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
         # Reciprocity: mean over both directions, or over both cross-polar terms of one antenna.
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
         residual = None
@@ -288,7 +285,9 @@ class _FarFieldTracer:
         """Trace few facets by clipped beams."""
         facets, incident = self.target.facets, -self.transmitters
         for solids, members in self.target.interiors:
-            found = trace_beams(facets, incident, depth, boundary=boundary, solids=solids)
+            found = beam_tracing.trace_beams(
+                facets, incident, depth, boundary=boundary, solids=solids
+            )
             yield list(found), solids, members
 
     def _trace_tube_orders(self, depth: int, tube_width: float) -> Iterator[_PatchOrders]:
@@ -319,15 +318,25 @@ class _FarFieldTracer:
         found: list[Tensor] = []
         powers: list[float] = []
         reflected = transmitted = torch.zeros(0)
+        polarisations = plane_waves.polarisations(self.receivers, self.target.up)
+        is_metal = self.target.is_smooth_metal  # fields are real
+        incident = self._incident_fields.to(torch.float64 if is_metal else torch.complex128)
         for patches in patch_orders:
+            received = polarisations[patches.aspect]
             if not found:
-                field = self._incident_fields.to(torch.complex128)[patches.aspect]
+                field = incident[patches.aspect]
             elif solids is None:
                 field = reflected[patches.parent]
             else:
                 through = patches.transmitted[:, None, None]
                 field = torch.where(through, transmitted[patches.parent], reflected[patches.parent])
                 field = field * patches.spreading[:, None, None]
+            if is_metal:
+                echo, reflected = plane_waves.scatter_from_metal(
+                    patches.normal, patches.direction, field, received
+                )
+                found.append(k * echo)
+                continue
             receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:
                 surface = (surface_rows, k, patches.normal, patches.direction, field)
@@ -340,7 +349,6 @@ class _FarFieldTracer:
                 radiated, reflected, transmitted = scatter_at_interfaces(
                     solids, surface_rows, k, patches, field, receiver
                 )
-            received = plane_waves.polarisations(self.receivers, self.target.up)[patches.aspect]
             found.append(plane_waves.dot(received[:, :, None], radiated[:, None]))
         _warn_power_gain(powers)
         return found
@@ -462,7 +470,7 @@ def _split_edges(wedges: wedge_geometry.Wedges, max_length: float) -> wedge_geom
 
 def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTarget:
     topology, vertices = connect_surfaces(scene)
-    facets = build_facets(vertices, topology)
+    facets = beam_tracing.build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
     tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]

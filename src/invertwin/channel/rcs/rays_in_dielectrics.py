@@ -16,22 +16,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.beams.beam_tracing import (
-    Facets,
-    IlluminatedPatches,
-    concatenate_patches,
-    exceeds_min_amplitude,
-)
+from invertwin.channel.beams import beam_tracing
+from invertwin.channel.beams.beam_tracing import Facets, IlluminatedPatches
+from invertwin.channel.em import plane_waves
 from invertwin.channel.em.dielectric_solids import DielectricSolids
-from invertwin.channel.em.plane_waves import (
-    area_vector,
-    barycentric_coordinates,
-    cross,
-    dot,
-    interpolate_vectors,
-    orthogonal_unit_vectors,
-    reflect_vectors,
-)
+from invertwin.channel.em.plane_waves import area_vector, cross, dot, interpolate_vectors
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
 from invertwin.channel.rcs import shooting_bouncing_rays
 from invertwin.channel.rows import Rows, concatenate_rows
@@ -167,7 +156,7 @@ def trace_inner_tubes(
                 tubes = replace(tubes, patch=tubes.patch + len(parts[0].aspect))
             parts.append(inner)
             begun.append(tubes)
-        found.append(concatenate_patches(parts))
+        found.append(beam_tracing.concatenate_patches(parts))
         tubes = concatenate_rows(begun)
         if not len(found[-1].aspect):
             return found[:-1]
@@ -223,7 +212,7 @@ def _continue_tubes(
     propagates = torch.nonzero(propagates & solids.transparent[patches.facet])[:, 0]
     row = torch.cat([again, propagates])
     transmitted = torch.arange(len(row)) >= len(again)
-    mirror = reflect_vectors(tubes.directions, tubes.normals)[again]
+    mirror = plane_waves.reflect_vectors(tubes.directions, tubes.normals)[again]
     directions = normalize(torch.cat([mirror, directions[propagates]]), dim=2)
     # Refraction changes the cross section as Fresnel's equations assume, at the patch's normal.
     cosine = -dot(patches.normal, patches.direction)
@@ -327,7 +316,7 @@ def _terminate_tubes(
 ) -> tuple[IlluminatedPatches, _RayTubes]:
     """Build the patches at the ends of tubes; ``facet`` at the centre, and at each corner."""
     facets, start = surface.facets, departing.corners[row]
-    weights = barycentric_coordinates(start[:, None], corners)
+    weights = plane_waves.barycentric_coordinates(start[:, None], corners)
     directions = normalize((weights[..., None] * departing.directions[row][:, None]).sum(2), dim=2)
     index = solids.permittivity_in(left.medium[row]).sqrt()
     # The phase is quadratic between corners of known slope.
@@ -365,7 +354,7 @@ def _terminate_tubes(
         wave_vector=wave_vector,
         spreading=spreading,
     )
-    keep = is_valid & exceeds_min_amplitude(patches, solids.wave_number)
+    keep = is_valid & beam_tracing.exceeds_min_amplitude(patches, solids.wave_number)
     solids.require_gaps(patches.facet[keep], patches.medium[keep])
     number = torch.arange(int(keep.sum()))
     fresh = torch.zeros_like(number, dtype=torch.bool)
@@ -406,7 +395,7 @@ def _spreading_factor(
     # A facet that is more oblique than the smooth surface is larger than the tube's footprint.
     oblique = section.norm(dim=1) * dot(normal, direction).abs()
     area = torch.maximum(dot(section, direction).abs(), oblique).maximum(least)
-    first = orthogonal_unit_vectors(direction)
+    first = plane_waves.orthogonal_unit_vectors(direction)
     axes = torch.stack([first, cross(direction, first)], 1)
     # One caustic where the determinant is negative, two where both eigenvalues are.
     turn, _ = torch.linalg.solve_ex(*((x[:, 1:] - x[:, :1]) @ axes.mT for x in (start, end)))

@@ -189,7 +189,8 @@ def inset_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 
     Args:
         corners: corners of the triangles [m].
     """
-    centre = corners.mean(1, keepdim=True)
+    a, b, c = corners.unbind(1)
+    centre = ((a + b + c) / 3)[:, None]  # a mean over an axis of three is ten times as slow
     return torch.cat([centre, corners + _CORNER_INSET * (centre - corners)], 1)
 
 
@@ -254,18 +255,21 @@ def _trace_next_order(
     max_height, far = _MAX_HEIGHT * min_tube_width, 3 * facets.size
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        row = row.repeat_interleave(points.shape[1])
         normal, way = previous.normal[row], far * directions[row]
-        starts = points.flatten(0, 1) + ray_offset(facets, normal)
-        found, along = find_next_surface(occluders, starts, starts + way)
+        starts = points + ray_offset(facets, normal)[:, None]
+        ends = (starts + way[:, None]).flatten(0, 1)
+        found, along = find_next_surface(occluders, starts.flatten(0, 1), ends)
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
-        other, face = facets.normal[found], metal_face[found]
-        behind = (along * dot(normal, way) < max_height) & (
+        own = metal_face[previous.facet[row]].repeat_interleave(points.shape[1])
+        again = torch.nonzero(metal_face[found] == own)[:, 0]
+        at = again // points.shape[1]
+        normal, way, other = normal[at], way[at], facets.normal[found[again]]
+        behind = (along[again] * dot(normal, way) < max_height) & (
             dot(other, way) * dot(other, normal) > 0
         )
-        again = torch.nonzero(behind & (face == metal_face[previous.facet[row]]))[:, 0]
-        way = way[again]
-        starts = starts[again] + along[again, None] * way + 2 * ray_offset(facets, way / far)
+        again, way = again[behind], way[behind]
+        starts = starts.flatten(0, 1)[again] + along[again, None] * way
+        starts = starts + 2 * ray_offset(facets, way / far)
         found[again] = find_next_surface(occluders, starts, starts + way)[0]
         return found.view(points.shape[:2])
 
