@@ -319,27 +319,26 @@ class _FarFieldTracer:
         powers: list[float] = []
         reflected = transmitted = torch.zeros(0)
         polarisations = plane_waves.polarisations(self.receivers, self.target.up)
-        is_metal = self.target.is_smooth_metal  # fields are real
-        incident = self._incident_fields.to(torch.float64 if is_metal else torch.complex128)
+        # Fields of smooth metal are real.
+        kind = torch.float64 if self.target.is_smooth_metal else torch.complex128
         for patches in patch_orders:
             received = polarisations[patches.aspect]
             if not found:
-                field = incident[patches.aspect]
+                field = self._incident_fields.to(kind)[patches.aspect]
             elif solids is None:
                 field = reflected[patches.parent]
             else:
                 through = patches.transmitted[:, None, None]
                 field = torch.where(through, transmitted[patches.parent], reflected[patches.parent])
                 field = field * patches.spreading[:, None, None]
-            if is_metal:
-                echo, reflected = plane_waves.scatter_from_metal(
-                    patches.normal, patches.direction, field, received
-                )
+            wave = patches.normal, patches.direction, field
+            if self.target.is_smooth_metal:
+                echo, reflected = plane_waves.scatter_from_metal(*wave, received)
                 found.append(k * echo)
                 continue
             receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:
-                surface = (surface_rows, k, patches.normal, patches.direction, field)
+                surface = (surface_rows, k, *wave)
                 radiated, reflected = (
                     plane_waves.radiate_field(*surface, receiver),
                     plane_waves.reflect_field(*surface),
