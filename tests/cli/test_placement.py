@@ -4,9 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from invertwin.cli.app import app
+from invertwin.cli.commands.view import load_display
 from invertwin.errors import InputError
 
 ROOM = """
@@ -99,7 +102,24 @@ def test_a_panel_is_placed_scored_and_drawn(tmp_path: Path):
     for name in ("landscape.png", "coverage.png", "report.html"):
         assert (out / name).stat().st_size > 1000
     assert (out / "checkpoint.pt").exists()
-    assert (out / "view.npz").exists()
+    # The viewer shows the panel where it was placed: on the wall, x = 3.9 m, y = along - 2.9 m.
+    places = panel_cells(out).mean((0, 1))
+    (best,) = (x for x in found["starts"] if x["scored_db"] == found["worst_after_db"])
+    assert places == pytest.approx([3.9, best["along_m"] - 2.9, 1.8], abs=1e-5)
+
+
+def test_a_run_file_shows_the_panel_where_fits_start(tmp_path: Path):
+    cells = panel_cells(written(tmp_path, ROOM.replace("bits = 2, ", "")))
+    assert len(cells) == 36
+    assert cells.mean((0, 1)) == pytest.approx([3.9, -2.9, 1.8], abs=1e-5)
+    assert np.ptp(cells.reshape(-1, 3), axis=0)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def panel_cells(target: Path) -> NDArray[np.float32]:
+    """Corners [cell, 4, 3] of the elements that `invertwin view` draws."""
+    layers = load_display(target)[0].layers
+    cells = [layer.points for layer in layers if layer.group.startswith("metasurface")]
+    return np.concatenate(cells).reshape(-1, 4, 3)
 
 
 @pytest.mark.parametrize(

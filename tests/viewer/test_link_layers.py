@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from invertwin.links import MapPlane, PropagationSettings, ReceiverPoints, Transmitters
+from invertwin.links import (
+    MapPlane,
+    Metasurface,
+    PropagationSettings,
+    ReceiverPoints,
+    Transmitters,
+)
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Object, PerfectConductor, RoughDielectric, Scene, plate, rigid
 from invertwin.viewer import DisplayLayer, link_layers
@@ -47,7 +53,7 @@ def test_cells_are_in_the_band_of_their_level():
     found = layers_of(floor(PerfectConductor()), RadioMap(plane, SETTINGS), levels)
     bands = {n.removeprefix("levels/"): x for n, x in found.items() if x.group == "levels"}
     assert len(bands) == 12
-    assert next(iter(bands)).endswith(" to 31")  # the highest
+    assert list(bands)[-1].endswith(" to 31")  # the highest
     assert sum(len(layer.points) for layer in bands.values()) == 4 * 31
     centres = plane.centres.reshape(-1, 3).numpy()
     for name, layer in bands.items():
@@ -61,3 +67,33 @@ def test_cells_are_in_the_band_of_their_level():
         first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
         areas = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
         assert areas == pytest.approx(0.125)
+
+
+@pytest.mark.parametrize(("spacing", "drawn"), [(0.1, 0.1), (0.001, 0.05)])
+def test_cells_of_a_metasurface_have_the_colour_of_their_phase(spacing, drawn):
+    # It stands 2 m from the transmitter and looks along y; a small one is drawn 0.2 m wide.
+    axes = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+    phase = torch.tensor([[0.1, 0.2], [3.0, 3.3], [-1.5, -1.5], [0.1, -3.0]]).double()
+    panel = Metasurface(torch.tensor([0.0, -2.0, 1.0]).double(), axes, phase, spacing)
+    receivers = ReceiverPoints(torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64))
+    settings = PropagationSettings(5e9, depth=0, panels=[panel])
+    found = layers_of(floor(PerfectConductor()), RadioMap(receivers, settings))
+    bands = {n.split("/")[1]: x for n, x in found.items() if x.group.startswith("metasurface")}
+    counts = {name: len(layer.faces) // 2 for name, layer in bands.items()}
+    # 3.3 rad are -171 degrees, as -3.0 rad are -172.
+    assert counts == {"-180 to -150": 2, "-90 to -60": 2, "0 to 30": 3, "150 to 180": 1}
+    assert len({layer.color for layer in bands.values()}) == 4
+    (single,) = (layer for name, layer in bands.items() if name == "150 to 180")
+    # Of the second row of four along y, which is -x in the world; the lower one of two.
+    middle = np.array([0.5 * drawn, -2.0, 1.0 - 0.5 * drawn])
+    assert single.points.mean(0) == pytest.approx(middle, abs=1e-6)
+    assert np.ptp(single.points, axis=0) == pytest.approx([0.9 * drawn, 0, 0.9 * drawn], abs=1e-6)
+    assert found["paths: metasurface"].points[1] == pytest.approx([0.0, -2.0, 1.0])
+
+
+def test_of_very_many_receivers_some_are_drawn():
+    receivers = ReceiverPoints(
+        torch.rand(1000, 3, generator=torch.Generator().manual_seed(1)).double()
+    )
+    found = layers_of(floor(PerfectConductor()), RadioMap(receivers, SETTINGS))
+    assert len(found["receivers"].points) == 63

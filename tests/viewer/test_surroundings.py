@@ -9,7 +9,7 @@ import torch
 
 from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, box, planar_array, plate, rigid
-from invertwin.viewer import Display, build_display
+from invertwin.viewer import Display, DisplayLayer, build_display
 from invertwin.viewer.surroundings import draw_ground, legend_html, open_walls, set_camera
 
 
@@ -55,6 +55,10 @@ def test_the_ground_has_metres_where_they_are(scale):
     assert middle[2] == pytest.approx(-1.0 * scale, abs=2e-2 * scale)
     texts = [(text, place) for name, (text, place) in drawn.labels.items() if "/x" in name]
     numbers = [(float(text), place[0]) for text, place in texts if text != "x [m]"]
+    # They stand on the side of the camera, which is to the left of the radar, and nothing twice.
+    assert np.array([place[1] for _, place in texts]) == pytest.approx(middle[1] + half[1])
+    places = np.array([place for _, place in drawn.labels.values()])
+    assert len(np.unique(places.round(6), axis=0)) == len(places)
     assert len(numbers) in range(3, 14)
     assert [text for text, _ in numbers] == pytest.approx([x for _, x in numbers], rel=1e-6)
     # Lines of the grid begin at its middle: a label stands on one of them.
@@ -135,3 +139,12 @@ def test_the_legend_names_the_roles_that_there_are():
     assert "radar" in text
     assert "truth" not in text
     assert "cube" not in text  # names of objects may be hostile
+
+
+def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
+    none = np.zeros((0, 3), np.float32)
+    names = {"paths: <b>": (1, 2, 3), "levels/low": (4, 5, 6), "levels/high": (7, 8, 9)}
+    layers = [DisplayLayer(name, "surface", none, color=color) for name, color in names.items()]
+    text = legend_html(Display("title", layers))
+    assert "paths: &lt;b&gt;" in text
+    assert 'rgb(4, 5, 6)">■</span><span style="color: rgb(7, 8, 9)">■</span> levels' in text

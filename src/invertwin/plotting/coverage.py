@@ -96,10 +96,8 @@ def _names(plane: MapPlane) -> list[str]:
     """Names of both axes."""
     found = []
     for axis, words in zip(_axes(plane), ("along the first side", "across it"), strict=True):
-        world = [
-            n for n, e in zip("xyz", torch.eye(3).double(), strict=True) if axis @ e > 1 - 1e-9
-        ]
-        found.append(f"{world[0] if world else words} [m]")
+        same = [n for n, e in zip("xyz", torch.eye(3).double(), strict=True) if axis @ e > 1 - 1e-9]
+        found.append(f"{same[0] if same else words} [m]")
     return found
 
 

@@ -167,11 +167,9 @@ def _draw(
         segments = vertices[sharp_edges(vertices, faces)][:, :, plane]
         axes.add_collection(LineCollection(list(segments), colors=_OUTLINE, linewidths=0.8))
     smallest = _MARKED_SHARE * max(window[2:])
-    small_marks = [
-        (v, {"marker": "o", "color": colors[k], "ms": 6}) for k, (v, _) in shapes.items()
-    ]
-    small_marks += [(v, {"marker": "+", "color": _OUTLINE, "ms": 11}) for v, _ in edges.values()]
-    for vertices, mark in small_marks:
+    marks = [(v, {"marker": "o", "color": colors[k], "ms": 6}) for k, (v, _) in shapes.items()]
+    marks += [(v, {"marker": "+", "color": _OUTLINE, "ms": 11}) for v, _ in edges.values()]
+    for vertices, mark in marks:
         if np.ptp(vertices[:, plane], axis=0).max() < smallest:
             axes.plot(*vertices[:, plane].mean(axis=0), linestyle="", **mark)
     if positions is not None:

@@ -60,11 +60,16 @@ class InteractiveSensor:
         radar: All positions.
         grid: Bins of the map.
         depth: Most bounces.
+
+    Attributes:
+        frames, ranges, across: As of ``DisplayMaps``.
     """
 
     def __init__(self, scene: Scene, radar: Radar, grid: Grid, depth: int = 1) -> None:
         self.scene = self._begun = replace_clouds(scene)
         self.radar, self.grid = radar, grid
+        self.frames, self.ranges = list(range(radar.frame_count)), grid.ranges.tolist()
+        self.across: list[float] = grid.u.tolist()
         sampling = Sampling(depth=depth, samples=_SAMPLES, boundary=False)
         self._model = SurrogateMap(grid, sampling=sampling)
 

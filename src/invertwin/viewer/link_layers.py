@@ -1,6 +1,7 @@
-"""Layers of links: transmitters, receivers, paths by what they meet, levels over a plane."""
+"""Layers of links: antennas, metasurfaces, paths by what they meet, levels over a plane."""
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,18 +9,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.channel import KINDS, trace_paths
+from invertwin.channel import KINDS
 from invertwin.errors import InputError
-from invertwin.links import MapPlane, PropagationSettings, ReceiverPoints, Transmitters
+from invertwin.links import MapPlane, Metasurface, PropagationSettings, ReceiverPoints, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Scene
 from invertwin.viewer.display import DisplayLayer
 from invertwin.viewer.layers import LEVELS, ROLES, join_points, to_float32
 from invertwin.viewer.panels import POWER_COLORMAP
 
-_MAX_RECEIVERS = 4  # whose paths are drawn
-_RAYS = 100_000
-_BANDS = 12  # of levels over a plane
+_MAX_RECEIVERS, _MAX_ANTENNAS = 4, 64  # whose paths, and which themselves are drawn
+_BANDS = 12  # of levels over a plane, of phases on a metasurface
+PHASES = "metasurface: phase −180° to 180°"
+"""Group of the cells of metasurfaces by their phase."""
+_BAND_LOOKS = {LEVELS: (POWER_COLORMAP, 0.8), PHASES: ("hsv", 1.0)}  # colours, opacity
+_CELL_SHARE = 0.9  # of a cell's side that is drawn, so that cells are apart
+_PANEL_SHARE = 0.1  # of the distance of transmitters: least side of a drawn metasurface
+_CORNERS = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]).double()  # of a cell
 _PATH_COLORS = ((40, 40, 40), (31, 119, 180), (44, 160, 44), (214, 39, 40), (148, 103, 189))
 
 
@@ -35,6 +41,8 @@ def link_layers(
         levels: Of the cells of a plane, along its first and its second side.
     """
     layers = [_draw_antennas("transmitters", sensor.positions)]
+    for panel in model.propagation.panels:
+        layers += _draw_cells(panel, sensor)
     if isinstance(model.places, ReceiverPoints):
         layers.append(_draw_antennas("receivers", model.places.positions))
         with suppress(InputError):  # of scenes without such paths
@@ -45,7 +53,8 @@ def link_layers(
 
 
 def _draw_antennas(name: str, places: Tensor) -> DisplayLayer:
-    return DisplayLayer(name, "points", to_float32(places), color=ROLES[name])
+    some = places[:: -(-len(places) // _MAX_ANTENNAS)]
+    return DisplayLayer(name, "points", to_float32(some), color=ROLES[name])
 
 
 def _draw_paths(
@@ -54,11 +63,9 @@ def _draw_paths(
     """Paths to some receivers, by the last of the ``KINDS`` that they meet."""
     chosen = np.linspace(0, len(receivers) - 1, min(len(receivers), _MAX_RECEIVERS)).astype(int)
     places, ends = sensor.positions.detach(), receivers.detach()[chosen]
-    depth, edges = settings.depth, min(settings.edges, 1)
+    few = replace(settings, edges=min(settings.edges, 1))
     with torch.no_grad():
-        paths = trace_paths(
-            scene, places, ends, settings.frequency, depth=depth, edges=edges, rays=_RAYS
-        )
+        paths = few.trace_links(scene, sensor, ends, 0)
     found: dict[int, list[Any]] = {}
     for tx, rx, met, at in zip(paths.tx, paths.rx, paths.kinds, paths.vertices, strict=True):
         points = torch.cat([places[tx][None], at[met > 0], ends[rx][None]])
@@ -71,22 +78,38 @@ def _draw_paths(
 
 
 def _draw_levels(plane: MapPlane, levels: NDArray[np.float64]) -> list[DisplayLayer]:
-    """Cells of a plane in bands of as many cells, the highest first: a slider hides the lowest."""
+    """Cells of a plane in bands of as many cells."""
+    sides = torch.stack([plane.first, plane.second]) / torch.tensor(plane.count)[:, None]
+    corners, known = plane.centres.reshape(-1, 1, 3) + _CORNERS @ sides, np.isfinite(levels.ravel())
+    values = levels.ravel()[known]
+    edges = np.quantile(values, np.linspace(0, 1, _BANDS + 1)) if len(values) else values
+    return _draw_bands(LEVELS, to_float32(corners)[known], values, edges)
+
+
+def _draw_cells(panel: Metasurface, sensor: Transmitters) -> list[DisplayLayer]:
+    """Cells of a metasurface in bands of their phase."""
+    least = _PANEL_SHARE * float((sensor.positions - panel.position).detach().norm(dim=1).amax())
+    scale = max(1.0, least / (panel.spacing * max(panel.phase.shape)))
+    offsets = panel.cells.offsets[:, None] + _CELL_SHARE * panel.spacing * _CORNERS
+    corners = panel.position + scale * offsets @ panel.axes[:, 1:].T
+    phases = np.rad2deg(panel.response.detach().angle().numpy())
+    return _draw_bands(PHASES, to_float32(corners), phases, np.linspace(-180, 180, _BANDS + 1))
+
+
+def _draw_bands(
+    group: str, corners: NDArray[Any], values: NDArray[Any], edges: NDArray[Any]
+) -> list[DisplayLayer]:
+    """Cells [cell, 4, 3] by bands of values, the lowest first, which a slider hides."""
     from matplotlib import colormaps
 
-    flat, layers = levels.ravel(), list[DisplayLayer]()
-    sides = [side / n for side, n in zip((plane.first, plane.second), plane.count, strict=True)]
-    turns = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]).double()
-    corners = to_float32(plane.centres.reshape(-1, 1, 3) + turns @ torch.stack(sides))
-    known = np.isfinite(flat)
-    edges = np.quantile(flat[known], np.linspace(0, 1, _BANDS + 1)) if known.any() else []
-    bands = np.digitize(flat, edges[1:-1])
-    for band in np.unique(bands[known])[::-1]:
-        own = corners[known & (bands == band)]
+    (colormap, opacity), layers = _BAND_LOOKS[group], list[DisplayLayer]()
+    bands = np.digitize(values, edges[1:-1])
+    for band in np.unique(bands):
+        own = corners[bands == band]
         faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(own))[:, None, None]
-        red, green, blue, _ = colormaps[POWER_COLORMAP](band / (_BANDS - 1), bytes=True)
-        color = int(red), int(green), int(blue)
-        name = f"{LEVELS}/{edges[band]:.4g} to {edges[band + 1]:.4g}"
+        red, green, blue, _ = colormaps[colormap]((band + 0.5) / _BANDS, bytes=True)
+        look = (int(red), int(green), int(blue)), opacity
+        name = f"{group}/{edges[band]:.4g} to {edges[band + 1]:.4g}"
         triangles = faces.reshape(-1, 3).astype(np.int32)
-        layers.append(DisplayLayer(name, "surface", own.reshape(-1, 3), triangles, color, 0.8))
+        layers.append(DisplayLayer(name, "surface", own.reshape(-1, 3), triangles, *look))
     return layers

@@ -269,8 +269,8 @@
     label.style = "display: inline-block; margin-right: 1em";
     part("layers").append(label);
   }
-  // Bands of a map of levels come with the highest first; the slider hides the lowest.
-  const bands = layers.filter((layer) => layer.group === "levels").reverse();
+  // Bands of a map of levels come with the lowest first, which the slider hides.
+  const bands = layers.filter((layer) => layer.group === "levels");
   if (bands.length > 1) {
     const label = document.createElement("label"), slider = document.createElement("input"), said = document.createElement("output");
     Object.assign(slider, { type: "range", min: 0, max: bands.length - 1, value: 0 });

@@ -78,12 +78,9 @@ def _collect_maps(
     display: Display, name: str, sensor: InteractiveSensor | None, count: int
 ) -> SensorMaps:
     known = display.maps.get(name)
-    if known is None:
-        assert sensor is not None
-        frames = list(range(sensor.radar.frame_count))
-        ranges, across = sensor.grid.ranges.tolist(), sensor.grid.u.tolist()
-    else:
-        frames, ranges, across = known.frames, known.ranges, known.across
+    own = known or sensor
+    assert own is not None
+    frames, ranges, across = own.frames, own.ranges, own.across
     chosen = np.unique(np.linspace(0, len(frames) - 1, count).astype(int)).tolist()
     frames = [frames[k] for k in chosen]
     blocks = [-(-len(axis) // _MAX_BINS) for axis in (ranges, across)]
@@ -98,14 +95,14 @@ def _collect_maps(
     if known is not None and panels.MEASURED in known.power:
         measured = max_pool(torch.from_numpy(known.power[panels.MEASURED][chosen]))
     simulated = None if sensor is None else _simulate_maps(display, sensor, frames)
-    places, rotations, origins = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
+    poses: tuple[Any, ...] = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0)
     if sensor is not None:
         radar = sensor.radar.frames(frames)
-        places, rotations, origins = radar.positions, radar.link().rotations, radar.origins
-    rows, columns = _block_axis(ranges, blocks[0]), _block_axis(across, blocks[1])
-    place, turn, origin = (to_float32(values) for values in (places, rotations, origins))
+        poses = radar.positions, radar.link().rotations, radar.origins
+    axes = (*_block_axis(ranges, blocks[0]), *_block_axis(across, blocks[1]))
     pooled = None if simulated is None else max_pool(simulated)
-    return SensorMaps(frames, (*rows, *columns), place, turn, origin, measured, pooled)
+    place, turn, origin = map(to_float32, poses)
+    return SensorMaps(frames, axes, place, turn, origin, measured, pooled)
 
 
 def _simulate_maps(display: Display, sensor: InteractiveSensor, frames: list[int]) -> Tensor | None:

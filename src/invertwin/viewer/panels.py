@@ -131,9 +131,7 @@ def _paint_bins(
 ) -> NDArray[np.uint8]:
     """Return a figure with its bins, the farthest range on top and the largest u on the left."""
     sizes = rows.stop - rows.start, columns.stop - columns.start
-    shares = [
-        np.arange(n)[::-1] * count // n for n, count in zip(sizes, colors.shape, strict=False)
-    ]
+    shares = [np.arange(n)[::-1] * bins // n for n, bins in zip(sizes, colors.shape, strict=False)]
     painted = figure.copy()
     bins = (255 * colors[shares[0][:, None], shares[1], :3]).astype(np.uint8)
     if chosen is not None:

@@ -30,6 +30,7 @@ _CURSOR = ("cursor: range", "cursor: azimuth")
 _MANY_LAYERS = 12  # of which the list is closed at first
 _PLAY_INTERVAL = 0.2  # seconds, from step to step
 _MAX_PATHS = 100  # rays that are drawn
+_IDENTITY = torch.eye(4, dtype=torch.float64)
 _SETTLE_TIME = 0.4  # seconds after which nothing moves
 
 
@@ -41,8 +42,7 @@ class _ViewerState:
     sensor: str
     frame: int = 0
     moved_object: str = _NO_OBJECT
-    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
-    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    motion: torch.Tensor = _IDENTITY  # of the moved object, world to world
     bin: tuple[int, int] | None = None
 
 
@@ -190,7 +190,7 @@ class Viewer:
 
     def _build_level_slider(self) -> None:
         """Let the person hide all cells below a level."""
-        bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS][::-1]
+        bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS]
         if len(bands) < 2:
             return
         lows = [(k, name.split("/")[1].split()[0]) for k, name in enumerate(bands)]
@@ -238,10 +238,9 @@ class Viewer:
 
     def _select_sensor(self, name: str) -> None:
         """Look through another sensor, from its first position."""
-        link, maps = self._links.get(name), self._display.maps.get(name)
-        frames = link.radar.frame_count if link else maps.frames[-1] + 1 if maps else 1
-        self._frame.max, self._frame.value = max(1, frames - 1), 0
-        self._frame.visible, self._bin.value = frames > 1, "move the cursor"
+        last = (self._links.get(name) or self._display.maps[name]).frames[-1]
+        self._frame.max, self._frame.value = max(1, last), 0
+        self._frame.visible, self._bin.value = last > 0, "move the cursor"
         axes = self._axes_of(name)
         self._panels.draw_axes(*axes)
         for slider, axis in zip(self._cursor, axes, strict=True):
@@ -256,41 +255,27 @@ class Viewer:
 
     def _select_object(self, name: str) -> None:
         """Let the person move an object, from where the step has it."""
-        self._release_object()
-        if name != _NO_OBJECT:
-            center = tuple(self._links[self._wish.sensor].scene[name].center.detach().tolist())
-            self._gizmo.position, self._gizmo.wxyz = center, (1.0, 0.0, 0.0, 0.0)
-            self._center = np.array(center)
-            self._update_state(moved_object=name, quaternion=(1.0, 0.0, 0.0, 0.0), position=center)
-        self._gizmo.visible = name != _NO_OBJECT
-
-    def _release_object(self) -> None:
-        """Put what was moved back."""
         node = self._nodes.get(f"twin/{self._wish.moved_object}")
-        if node is not None:
+        if node is not None:  # what was moved before goes back
             node.wxyz, node.position = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        self._update_state(moved_object=_NO_OBJECT)
+        self._update_state(moved_object=name, motion=_IDENTITY)
+        if name != _NO_OBJECT:
+            self._center = self._links[self._wish.sensor].scene[name].center.detach().numpy()
+            self._gizmo.position, self._gizmo.wxyz = tuple(self._center), (1.0, 0.0, 0.0, 0.0)
+        self._gizmo.visible = name != _NO_OBJECT
 
     def _follow_gizmo(self) -> None:
         """Follow the gizmo: the surface at once, the map when it is traced."""
-        wish = self._wish
-        if wish.moved_object == _NO_OBJECT:
+        if self._wish.moved_object == _NO_OBJECT:
             return
-        turn = tuple(float(x) for x in self._gizmo.wxyz)
-        place = tuple(float(x) for x in self._gizmo.position)
-        node = self._nodes.get(f"twin/{wish.moved_object}")
+        turn, place = (torch.tensor(x).double() for x in (self._gizmo.wxyz, self._gizmo.position))
+        rotation = rotation_from_quaternion(turn)
+        motion = rigid(rotation, place - rotation @ torch.from_numpy(self._center))
+        node = self._nodes.get(f"twin/{self._wish.moved_object}")
         if node is not None:
-            motion = self._rigid_motion(turn, place).numpy()
             with self._server.atomic():
-                node.wxyz, node.position = turn, motion[:3, 3]
-        self._update_state(quaternion=turn, position=place)
-
-    def _rigid_motion(
-        self, quaternion: tuple[float, ...], position: tuple[float, ...]
-    ) -> torch.Tensor:
-        rotation = rotation_from_quaternion(torch.tensor(quaternion, dtype=torch.float64))
-        center = torch.as_tensor(self._center, dtype=torch.float64)
-        return rigid(rotation, torch.tensor(position, dtype=torch.float64) - rotation @ center)
+                node.wxyz, node.position = self._gizmo.wxyz, motion[:3, 3].numpy()
+        self._update_state(motion=motion)
 
     def _draw_layer(self, layer: DisplayLayer, size: float = 1.0) -> None:
         """Draw a layer, in place of the one of its name."""
@@ -374,8 +359,7 @@ class Viewer:
             maps |= found.maps_of_frame(state.frame)
         scene = None if link is None else link.scene
         if link is not None and state.moved_object != _NO_OBJECT:
-            motion = self._rigid_motion(state.quaternion, state.position)
-            scene = link.move_object(state.moved_object, motion)
+            scene = link.move_object(state.moved_object, state.motion)
         if link is not None and scene is not None:
             maps |= {SIMULATED: to_float32(link.predict_map(scene, state.frame))}
         self._panels.show(maps, state.bin)
@@ -390,11 +374,8 @@ class Viewer:
 
     def _axes_of(self, sensor: str) -> tuple[list[float], list[float]]:
         """Range [m] of each row and u of each column of a sensor's maps."""
-        if sensor in self._links:
-            grid = self._links[sensor].grid
-            return grid.ranges.tolist(), grid.u.tolist()
-        maps = self._display.maps[sensor]
-        return maps.ranges, maps.across
+        own = self._links.get(sensor) or self._display.maps[sensor]
+        return own.ranges, own.across
 
     def _show_paths(self, sample: PositionSample, chosen: tuple[int, int] | None) -> None:
         points = to_float32(sample.points)

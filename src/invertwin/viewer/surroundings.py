@@ -1,11 +1,12 @@
 """Surroundings of a scene in the window: ground with metres, first camera, legend, walls."""
 
+from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from invertwin.viewer.display import Display
+from invertwin.viewer.display import SCENE_GROUPS, Display
 from invertwin.viewer.layers import ROLES
 
 _TICKS = 6  # of the ground along its longer side, about
@@ -14,6 +15,7 @@ _ASIDE = np.deg2rad(12.0)  # of the first camera from the sight of the radar
 _FIELD_OF_VIEW = np.deg2rad(50.0)  # of the first camera, from below to above
 _USED_TANGENT = 0.85 * np.tan(_FIELD_OF_VIEW / 2)  # of its half height, and its half width
 _PANEL_SHARE = 0.55  # of half the height by which a phone's scene stands above the middle
+_WHOLE = 'style="display: inline-block; margin-right: 1em"'  # squares stay beside the name
 _WALL_SHARE = 0.6  # of the scene's sides that a wall spans
 
 
@@ -37,12 +39,22 @@ def draw_ground(scene: Any, display: Display) -> None:
     plane, sides = "".join("xyz"[axis] for axis in across), (cell * count[across]).tolist()
     lines = {"plane": plane, "cell_size": cell, "section_size": cell}
     scene.add_grid("/ground", *sides, position=tuple(middle), **lines)
+    # Labels stand on the sides towards the camera, where no object is before them.
+    steps = np.where(_first_sight(display) > 0, 1, -1)
+    corner = middle - 0.5 * cell * count * steps
     for axis, other, name in zip(across, across[::-1], plane, strict=True):
-        for number in range(int(count[axis]) + 1):
+        for number in range(1, int(count[axis]) + 1):
             place = middle.copy()
-            place[axis], place[other] = start[axis] + number * cell, start[other]
+            place[axis], place[other] = corner[axis] + number * cell * steps[axis], corner[other]
             text = f"{round(place[axis], 6):g}" if number < count[axis] else f"{name} [m]"
             scene.add_label(f"/ground/{name}{number}", text, position=tuple(place))
+
+
+def _first_sight(display: Display) -> NDArray[np.float64]:
+    """Direction in which the first camera looks."""
+    up, ahead = np.array(display.up), np.array(display.ahead)
+    level = np.cos(_ASIDE) * ahead - np.sin(_ASIDE) * np.cross(up, ahead)
+    return np.cos(_ELEVATION) * level - np.sin(_ELEVATION) * up
 
 
 def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
@@ -54,10 +66,7 @@ def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
         aspect: Width of the window over its height; below 1, as on a phone, the scene is in the
             upper part, above the panel.
     """
-    up, ahead = np.array(display.up), np.array(display.ahead)
-    left = np.cross(up, ahead)
-    sight = np.cos(_ASIDE) * ahead - np.sin(_ASIDE) * left
-    sight = np.cos(_ELEVATION) * sight - np.sin(_ELEVATION) * up
+    up, sight = np.array(display.up), _first_sight(display)
     right = np.cross(sight, up) / np.linalg.norm(np.cross(sight, up))
     points = _framed_points(display)
     middle = 0.5 * (points.min(0) + points.max(0)).astype(float)
@@ -72,16 +81,19 @@ def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
 
 
 def legend_html(display: Display) -> str:
-    """A legend of the colours of surfaces, with a style that hides what viser says without a GPU.
+    """A legend of the colours of layers, with a style that hides what viser says without a GPU.
 
     Args:
         display: What is shown.
     """
-    used = {layer.color for layer in display.layers}
-    roles = [(color, role) for role, color in ROLES.items() if color in used]
-    rows = [f'<span style="color: rgb{color}">■</span> {role}' for color, role in roles]
+    roles, keys = {color: role for role, color in ROLES.items()}, dict[str, dict[str, None]]()
+    for layer in display.layers:
+        has_role = layer.group in (*SCENE_GROUPS, "boards")
+        name = roles.get(layer.color, "fixed") if has_role else layer.group
+        keys.setdefault(name, {})[f'<span style="color: rgb{layer.color}">■</span>'] = None
+    rows = [f"<span {_WHOLE}>{''.join(own)} {escape(name)}</span>" for name, own in keys.items()]
     hidden = "<style>#webgl-software-rendering { display: none }</style>"
-    return f'{hidden}<div style="padding: 0.3em 1em">{" &nbsp; ".join(rows)}</div>'
+    return f'{hidden}<div style="padding: 0.3em 1em">{" ".join(rows)}</div>'
 
 
 def open_walls(display: Display) -> dict[str, NDArray[np.int32]]:

@@ -88,12 +88,10 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
             radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
-    drawn = save_picture(
-        folder, "look", plotting.panels(shown), f"Frame {options.frame}", "doppler"
-    )
+    view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", "doppler")
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
     again = options.command("look", folder.path)
-    parts = [*tables, drawn]
+    parts = [*tables, view]
     if grid.u_count > 1 and points is not None and len(points):
         maps, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
         above = plotting.from_above(maps, grid, one, {"detections": points.position})

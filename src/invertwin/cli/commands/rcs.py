@@ -218,20 +218,18 @@ def _make_tables(scenes: Mapping[str, _RcsMetrics]) -> list[ReportTable]:
     columns = letters.pop() if len(letters) == 1 else ("co-polar", "cross", "cross", "orthogonal")
     notes = load_texts("notes")
     tables = [ReportTable("Peaks [dBsm]", ["target", *columns], peaks, notes["rcs_peaks"])]
-    cases = [
-        [name, case, error]
-        for name, found in scenes.items()
-        for case, error in found.get("error_db", {}).items()
-    ]
+    cases = _rows_of(scenes, "error_db")
     if cases:
         columns = ["target", "case", "error [dB]"]
         tables.append(ReportTable("Against what is known", columns, cases, notes["rcs_cases"]))
-    rows = [
-        [name, key, error, found["mean_db_optics"][key]]
-        for name, found in scenes.items()
-        for key, error in found.get("mean_db", {}).items()
-    ]
+    optics = {name: found.get("mean_db_optics", {}) for name, found in scenes.items()}
+    rows = [[name, key, mean, optics[name][key]] for name, key, mean in _rows_of(scenes, "mean_db")]
     if rows:
         columns = ["target", "frequency, polarisation", "mean error [dB]", "physical optics alone"]
         tables.append(ReportTable("Against measurements", columns, rows, notes["rcs_measured"]))
     return tables
+
+
+def _rows_of(scenes: Mapping[str, _RcsMetrics], key: str) -> list[list[Any]]:
+    """Name of the scene, name of the value, and the value."""
+    return [[name, *item] for name, own in scenes.items() for item in own.get(key, {}).items()]

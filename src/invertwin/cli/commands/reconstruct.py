@@ -143,11 +143,9 @@ def _write(
         save_mesh(folder.file("twin.glb"), twin)
     if best["checkpoint"] != CHECKPOINT:
         shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
-    title, outcome = run.title or problem.kind.title, summary.outcome
-    tables = write_report(
-        folder, metrics, title, outcome, parts, again="reconstruct", note=run.note
-    )
-    return tables, outcome
+    title, status = run.title or problem.kind.title, summary.outcome
+    tables = write_report(folder, metrics, title, status, parts, again="reconstruct", note=run.note)
+    return tables, status
 
 
 def _show_step(live: Viewer, problem: Problem, going: Fit, step: DisplayStep) -> None:

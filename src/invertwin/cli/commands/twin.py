@@ -131,12 +131,11 @@ def _object_table(twin: Twin) -> report.ReportTable:
     rows: list[list[Any]] = []
     for thing in twin.objects:
         figure = thing.shape
-        size, yaw, rate = None, None, None
+        size, yaw = None, None
         if figure is not None:
             size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
             yaw = math.degrees(figure.yaw) if figure.has_yaw else None
-        if thing.velocity is not None:
-            rate = float(thing.velocity.norm())
+        rate = None if thing.velocity is None else float(thing.velocity.norm())
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
         row = [thing.name, share, thing.existence_probability, *thing.position.tolist()]
         rows.append([*row, _position_deviation(thing) or None, yaw, size, rate])

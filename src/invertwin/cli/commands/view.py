@@ -13,7 +13,7 @@ from rich.console import Console
 from invertwin import viewer
 from invertwin.capture import Capture, search_ranges
 from invertwin.channel import Grid
-from invertwin.cli.fits.displays import VIEW_FILE
+from invertwin.cli.fits.displays import VIEW_FILE, placement_layers
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.inputs import find_viewed_file
 from invertwin.cli.run_file import load_run, prefix_file_errors
@@ -92,7 +92,7 @@ def _display_of_run(
         }
         display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
         display = replace(display, steps=[] if is_fit else _steps_in_time(run, own))
-        antennas = _build_link_layers(run, own, folder)
+        antennas = [] if is_fit and run.placement else _build_link_layers(run, own, folder)
     if folder is not None and is_fit:
         display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():
@@ -132,7 +132,11 @@ def _steps_in_time(run: RunFile, scene: Scene) -> list[viewer.DisplayStep]:
 
 
 def _build_link_layers(run: RunFile, scene: Scene, folder: Path | None) -> list[Any]:
-    """Antennas, paths and levels of a run file with receivers or a map; else none."""
+    """Antennas, paths, levels and metasurface of a run file of links; else none."""
+    if run.placement is not None:
+        table, coverage = run.placement, run.placement.coverage(scene, run.seed)
+        panel = table.place(coverage, table.initial)(table.metasurface())
+        return placement_layers(coverage, panel)
     if run.map is None or run.transmitter is None:
         return []
     file, levels = None if folder is None else folder / "map.csv", None

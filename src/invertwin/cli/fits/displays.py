@@ -15,6 +15,9 @@ from invertwin.cli.fits.problem import Fits, Problem, SensorData, Start
 from invertwin.errors import InputError
 from invertwin.inversion import Callback
 from invertwin.inversion.fit import Fit
+from invertwin.links import Metasurface, PropagationSettings, ReceiverPoints, Transmitters
+from invertwin.links.metasurface.coverage import Coverage
+from invertwin.models.radio import RadioMap
 from invertwin.scene import Scene
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.folders import PARTS
@@ -121,9 +124,24 @@ def make_fit_display(
     names = [name for name in fits.problem.run.fitted_objects if name in start.names]
     more = viewer.scene_layers(start, "start", fitted=names, fitted_only=True)
     layers = [*display.layers, *more, *viewer.ellipsoid_layers(twin, metrics)]
+    for item, sensor in zip(fits.problem.sensor_data.values(), fits.found.sensors, strict=True):
+        if isinstance(sensor, Metasurface):
+            layers += placement_layers(item.recording, sensor)
     spectra = {viewer.MEASURED: fits.maps["measured"], viewer.SIMULATED: fits.maps["twin"]}
     seen = make_sensor_maps(fits.problem, spectra)
     return replace(display, layers=layers, steps=steps, maps=seen)
+
+
+def placement_layers(coverage: Coverage, panel: Metasurface) -> list[viewer.DisplayLayer]:
+    """Layers of a metasurface that is placed: antennas, cells, and paths to some receivers.
+
+    Args:
+        coverage: Of the receivers.
+        panel: The metasurface where it stands.
+    """
+    settings = PropagationSettings(coverage.frequency, 0.0, depth=1, panels=[panel])
+    model = RadioMap(ReceiverPoints(coverage.receivers), settings)
+    return viewer.link_layers(coverage.scene, Transmitters(coverage.tx[None]), model)
 
 
 def make_sensor_maps(

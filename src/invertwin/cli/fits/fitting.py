@@ -269,10 +269,8 @@ def _fit_or_search(
         return inversion.reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
     starts = problem.kind.make_candidates(problem, start, torch.Generator().manual_seed(seed))
-    screening = inversion.Screening(starts, run.search.fits, run.search.shortlist)
-    ends = inversion.search(
-        *given, screening, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
-    )
+    screened = inversion.Screening(starts, run.search.fits, run.search.shortlist)
+    ends = inversion.search(*given, screened, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how)
     return ends.best, {"checkpoint": f"{part}{ends.best_number}.pt", **ends.to_metrics()}
 
 

@@ -34,9 +34,7 @@ _INITIAL_METRICS = (
     ("loss without extra width", "start_loss_sharp", "loss_sharp"),
 )
 _START_CURVE_KEY = f"start_{CURVE_KEY}"
-START_COLUMNS = load_texts("starts") | {
-    key: f"{name} off by" for key, name in _MATERIAL_ERRORS.items()
-}
+START_COLUMNS = load_texts("starts") | {k: f"{name} off by" for k, name in _MATERIAL_ERRORS.items()}
 """Heads of the table of starts; what metrics.json says of the best one."""
 
 
@@ -169,9 +167,8 @@ def state_positions(fits: Fits, confidence: Row) -> str:
         text = f"{name} at ({place}){f' ± {math.hypot(*own):.2g}' if any(own) else ''} m"
         for axis in (axis for axis in ANGLES if f"{name}.{axis}" in values):
             width = math.degrees(bars.get(f"{name}.{axis}", 0.0))
-            text += (
-                f", {axis} {values[f'{name}.{axis}'][1]:.1f}{f' ± {width:.2g}' if width else ''}°"
-            )
+            value = f"{values[f'{name}.{axis}'][1]:.1f}" + (f" ± {width:.2g}" if width else "")
+            text += f", {axis} {value}°"
         said.append(text)
     return "; ".join(said)
 

@@ -239,11 +239,9 @@ def prior_shape(
         file: that `invertwin train-prior` wrote; without it the prior of the package.
         counts: nodes along x, y and z at which it is meshed; without it every 0.1 m or so.
     """
-    known: Any = table
-    same = getattr(known, "shape", None) == "prior" and known.prior == file
-    return scenes.PriorShape(
-        object, scenes.load_prior(file), known.latent if same else None, counts
-    )
+    own: Any = table
+    same = getattr(own, "shape", None) == "prior" and own.prior == file
+    return scenes.PriorShape(object, scenes.load_prior(file), own.latent if same else None, counts)
 
 
 def body_joints(
