@@ -237,7 +237,8 @@ class ShapeSearch:
             shapes: known shapes.
             born: groups of the image, and their proposed shapes.
         """
-        found, tried = list(born), set[tuple[int, int]]()
+        # Tried pairs are kept: the number of a group that is no more would go to another one.
+        found, tried = list(born), dict[tuple[int, int], object]()
         places = self.image_grid.positions
         while True:
             pairs = [
@@ -249,7 +250,7 @@ class ShapeSearch:
             if not pairs:
                 return found
             _, a, b = min(pairs, key=lambda pair: pair[0])
-            tried.add((id(a[0]), id(b[0])))
+            tried[id(a[0]), id(b[0])] = a, b
             others = [pair for pair in found if pair is not a and pair is not b]
             known = [*shapes, *(one for _, one in others)]
             part = a[0] + b[0]
