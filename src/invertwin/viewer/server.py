@@ -193,10 +193,12 @@ class Viewer:
         bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS]
         if len(bands) < 2:
             return
-        lows = [(k, name.split("/")[1].split()[0]) for k, name in enumerate(bands)]
-        slider = self._server.gui.add_slider("lowest level", 0, len(bands) - 1, 1, 0, marks=lows)
+        lows = [name.split("/")[1].split()[0] for name in bands]
+        marks = (0, lows[0]), (len(bands) - 1, lows[-1])  # more would overlap
+        slider = self._server.gui.add_slider("lowest level", 0, marks[1][0], 1, 0, marks=marks)
 
         def hide_lower(_: Any) -> None:
+            slider.label = f"lowest level: {lows[int(slider.value)]}"
             self._hidden = set(bands[: int(slider.value)])
             self._set_visibility(layers.LEVELS, self._visible[layers.LEVELS])
 

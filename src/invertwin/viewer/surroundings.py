@@ -87,10 +87,9 @@ def legend_html(display: Display) -> str:
         display: What is shown.
     """
     roles, keys = {color: role for role, color in ROLES.items()}, dict[str, dict[str, None]]()
-    for layer in display.layers:
-        has_role = layer.group in (*SCENE_GROUPS, "boards")
-        name = roles.get(layer.color, "fixed") if has_role else layer.group
-        keys.setdefault(name, {})[f'<span style="color: rgb{layer.color}">■</span>'] = None
+    for x in display.layers:
+        name = roles.get(x.color, "fixed") if x.group in (*SCENE_GROUPS, "boards") else x.group
+        keys.setdefault(name, {})[f'<span style="color: rgb{x.color}">■</span>'] = None
     rows = [f"<span {_WHOLE}>{''.join(own)} {escape(name)}</span>" for name, own in keys.items()]
     hidden = "<style>#webgl-software-rendering { display: none }</style>"
     return f'{hidden}<div style="padding: 0.3em 1em">{" ".join(rows)}</div>'

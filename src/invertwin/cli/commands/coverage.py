@@ -48,7 +48,7 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
         "largest": float(best.max()),
         "wall_seconds": time.perf_counter() - begin,
     }
-    parts: list[Any] = [quantity_table("Coverage", metrics, label_table="coverage")]
+    parts: list[Any] = [quantity_table(name, metrics, label_table="coverage")]
     if isinstance(places, MapPlane):
         maps = {f"transmitter {k}": one for k, one in enumerate(values, 1)}
         figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, label=name)

@@ -88,7 +88,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
             radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
-    view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", "doppler")
+    told = "directions" if chirps is None else "doppler"
+    view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", told)
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
     again = options.command("look", folder.path)
     parts = [*tables, view]
