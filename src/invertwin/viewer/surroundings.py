@@ -31,8 +31,8 @@ def draw_ground(scene: Any, display: Display) -> None:
     points = _framed_points(display)
     low, high = points.min(0).astype(float), points.max(0).astype(float)
     cell = _round_step(float((high - low)[across].max()) / _TICKS)
-    start, count = cell * np.floor(low / cell), np.ceil((high - low) / cell) + 1
-    count += count % 2  # the lines of viser begin at the middle
+    start, count = cell * np.floor(low / cell), np.ceil(high / cell) - np.floor(low / cell)
+    count = np.maximum(count + count % 2, 2)  # the lines of viser begin at the middle
     middle = start + 0.5 * cell * count
     sign = np.sign(display.up[up])
     middle[up] = display.box[0 if sign > 0 else 1][up] - 1e-3 * cell * sign  # below floors
