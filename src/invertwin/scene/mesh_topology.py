@@ -23,7 +23,9 @@ CRACK_TOLERANCE = 1e-4
 """Width of the widest cracks between open edges that are closed, relative to the same."""
 
 Points: TypeAlias = Float64[np.ndarray, "v 3"]
+Faces: TypeAlias = Int64[np.ndarray, "f 3"]
 Groups: TypeAlias = Int64[np.ndarray, " v"]
+Owner: TypeAlias = Int64[np.ndarray, " f"] | int  # object of each triangle
 _LINE = 0.8191, 0.4731, 0.3244  # a direction across no planes that people draw
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
 _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
@@ -52,11 +54,8 @@ class Cracks(NamedTuple):
 
 
 def close_cracks(
-    points: Points,
-    faces: Int64[np.ndarray, "f 3"],
-    groups: Groups | None = None,
-    owner: Int64[np.ndarray, " f"] | int = 0,
-) -> tuple[Int64[np.ndarray, "f 3"], MeshEdges, Points, Cracks]:
+    points: Points, faces: Faces, groups: Groups | None = None, owner: Owner = 0
+) -> tuple[Faces, MeshEdges, Points, Cracks]:
     """Weld vertices and close cracks: triangles, edges, positions, and what closes the cracks.
 
     Positions are in units of the size of their group, vertices where they have moved.
@@ -236,7 +235,7 @@ def overlapping_boxes(
     return meets & meets.T
 
 
-def triangle_sides(faces: Int64[np.ndarray, "f 3"]) -> Int64[np.ndarray, "h 2"]:
+def triangle_sides(faces: Faces) -> Int64[np.ndarray, "h 2"]:
     """Return the ends of the sides of triangles in their direction: all first sides, and so on.
 
     Args:
@@ -280,12 +279,7 @@ class MeshEdges(NamedTuple):
     triangle: Int64[np.ndarray, " h"]
 
 
-def find_edges(
-    faces: Int64[np.ndarray, "f 3"],
-    places: Points,
-    owner: Int64[np.ndarray, " f"] | int = 0,
-    shortest: float = 0.0,
-) -> MeshEdges:
+def find_edges(faces: Faces, places: Points, owner: Owner = 0, shortest: float = 0.0) -> MeshEdges:
     """Find the edges of triangles.
 
     Slivers and repetitions of a triangle in one object have none. A side on which vertices of
@@ -304,18 +298,14 @@ def find_edges(
     return _split_at_vertices(whole, places, shortest)
 
 
-def _sides_of(
-    faces: Int64[np.ndarray, "f 3"], number: Int64[np.ndarray, " n"], vertex_count: int
-) -> MeshEdges:
+def _sides_of(faces: Faces, number: Int64[np.ndarray, " n"], vertex_count: int) -> MeshEdges:
     """Group the sides of some triangles by edges."""
     used = faces[number]
     apex = used[:, [2, 0, 1]].T.ravel()
     return _group_sides(triangle_sides(used), apex, np.tile(number, 3), vertex_count)
 
 
-def find_distinct_faces(
-    faces: Int64[np.ndarray, "f 3"], places: Points, owner: Int64[np.ndarray, " f"] | int = 0
-) -> Int64[np.ndarray, " n"]:
+def find_distinct_faces(faces: Faces, places: Points, owner: Owner = 0) -> Int64[np.ndarray, " n"]:
     """Return the numbers of triangles that are neither slivers nor repetitions in one object.
 
     Args:
@@ -331,9 +321,7 @@ def find_distinct_faces(
     return number if len(start) == len(order) else number[np.sort(order[start])]
 
 
-def merge_doubled_sides(
-    edges: MeshEdges, places: Points, owner: Int64[np.ndarray, " f"] | int = 0
-) -> MeshEdges:
+def merge_doubled_sides(edges: MeshEdges, places: Points, owner: Owner = 0) -> MeshEdges:
     """Keep one of the half edges of an object that lie in one half plane at an edge.
 
     Where faces are doubled, by other triangles or by bodies with planes in common, the surface
@@ -441,7 +429,7 @@ def _split_at_vertices(edges: MeshEdges, places: Points, shortest: float = 0.0) 
     return _group_sides(parts, edges.apex[piece], edges.triangle[piece], len(places))
 
 
-def find_parts(faces: Int64[np.ndarray, "f 3"], places: Points) -> Int64[np.ndarray, " f"]:
+def find_parts(faces: Faces, places: Points) -> Int64[np.ndarray, " f"]:
     """Return the part of each triangle, connected across edges; −1 = none.
 
     Where bodies touch along an edge, neighbours are those that bound one body by their normals.
@@ -470,7 +458,7 @@ def _pairs_at_edges(edges: MeshEdges, values: Int64[np.ndarray, " h"]) -> Int64[
 
 
 def _pairs_of_bodies(
-    edges: MeshEdges, around: Sequence[np.ndarray], faces: Int64[np.ndarray, "f 3"], places: Points
+    edges: MeshEdges, around: Sequence[np.ndarray], faces: Faces, places: Points
 ) -> Int64[np.ndarray, "n 2"]:
     """Return triangles that follow each other around an edge of several, with a body in between."""
     side, edge, plane = around
@@ -543,9 +531,7 @@ def find_vertices_on_edges(
     return row[on], vertex[on], along[on] / length[row[on]]
 
 
-def find_inward_faces(
-    faces: Int64[np.ndarray, "f 3"], points: Float64[np.ndarray, "v 3"]
-) -> Bool[np.ndarray, " f"]:
+def find_inward_faces(faces: Faces, points: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " f"]:
     """Mask of triangles of closed bodies to be turned for all normals to point outwards.
 
     Parts that are wound consistently stay as they are relative to each other, so that the inner
@@ -568,7 +554,7 @@ def find_inward_faces(
     return ~inward if _volume(faces, points) < 0 else inward
 
 
-def _is_consistent(faces: Int64[np.ndarray, "f 3"], vertex_count: int) -> bool:
+def _is_consistent(faces: Faces, vertex_count: int) -> bool:
     """Test that triangles run along each edge as often in one direction as in the other.
 
     The sum over all sides of a product of random numbers of their ends decides, with the sign of
@@ -583,9 +569,7 @@ def _is_consistent(faces: Int64[np.ndarray, "f 3"], vertex_count: int) -> bool:
 
 
 def _point_inwards(
-    faces: Int64[np.ndarray, "f 3"],
-    part: Int64[np.ndarray, " f"],
-    points: Float64[np.ndarray, "v 3"],
+    faces: Faces, part: Int64[np.ndarray, " f"], points: Float64[np.ndarray, "v 3"]
 ) -> Bool[np.ndarray, " part"]:
     """Mask of parts whose normals point into bodies, of parts that are consistent."""
     surfaces = [faces[part == number] for number in range(part.max() + 1)]
@@ -599,7 +583,7 @@ def _point_inwards(
     return inwards
 
 
-def _volume(faces: Int64[np.ndarray, "f 3"], points: Float64[np.ndarray, "v 3"]) -> float:
+def _volume(faces: Faces, points: Float64[np.ndarray, "v 3"]) -> float:
     """Signed volume of the body that triangles bound [m³]."""
     near = points - points[faces[0, 0]]  # far from the origin, differences would cancel
     return float(igl.centroid(near, np.ascontiguousarray(faces))[1])

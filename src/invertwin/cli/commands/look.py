@@ -88,8 +88,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
             radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
     tables = [quantity_table(title, metrics), *warning_tables(said)]
-    told = "directions" if chirps is None else "doppler"
-    view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", told)
+    kind = "directions" if chirps is None else "doppler"
+    view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", kind)
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
     again = options.command("look", folder.path)
     parts = [*tables, view]
