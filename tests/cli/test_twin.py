@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,10 @@ import torch
 import invertwin as iw
 from cli.small import call
 from invertwin.capture import Capture
+from invertwin.channel import Grid
+from invertwin.cli.commands.twin import _state_objects
 from invertwin.cli.run_file import load_run
+from invertwin.discovery import DetectedObject, Twin
 from invertwin.scene import linear_array
 
 STILL = torch.zeros(1, 3, dtype=torch.float64)
@@ -162,3 +166,26 @@ def test_what_it_cannot_do_is_one_line(
     assert said in err
     assert "Traceback" not in err
     assert not (tmp_path / "found" / "metrics.json").exists()
+
+
+def test_an_object_without_a_known_place_is_doubtful():
+    """Both are likely, one somewhere within 4 m of a grid that ends at 6 m."""
+    bins = Grid(0.0, 0.1, 61)
+    places = [
+        ({"x": 0.02, "y": 0.05}, 0.9),
+        ({"x": 4.0, "y": 0.1}, 0.9),
+        ({"x": 0.1, "y": 0.1}, 0.4),
+    ]
+    found = Twin(
+        tuple(
+            DetectedObject.point(
+                f"object_{k}", torch.tensor([1.0, k, 0.0]).double(), deviations, sure
+            )
+            for k, (deviations, sure) in enumerate(places)
+        ),
+        0.0,
+        grid=bins,
+    )
+    expected = "1 object found, 2 doubtful; point at (1.000, 0.000) ± 0.05 m"
+    assert _state_objects(found) == (1, expected)
+    assert _state_objects(replace(found, grid=None))[0] == 2

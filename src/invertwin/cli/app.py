@@ -220,7 +220,7 @@ def look(options: command_options.LookOptions) -> None:
 
 @_command_with(command_options.TwinOptions, _DATA)
 def twin(options: command_options.TwinOptions) -> None:
-    """Find what stands in a recording, with no start: things, places, sizes, confidences."""
+    """Find what stands in a recording, with no start: objects, positions, sizes, confidences."""
     _run_recording(options, "_twin")
 
 

@@ -25,8 +25,9 @@ from invertwin.plotting import spectrum
 from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mesh
 from invertwin.storage.run_folder import RunFolder
 
-_MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of things that are counted
-_MAX_STATED = 6  # things in the sentence that says what was found
+_MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of objects that are counted
+_MAX_DEVIATION = 0.5  # of their positions over the longest range: more is a place unknown
+_MAX_STATED = 6  # objects in the sentence that says what was found
 # Of the command line; they win over those of a run file.
 _TWIN_OPTION_NAMES = ("low", "high", "range_max", "level", "height", "rays", "seed")
 
@@ -111,8 +112,11 @@ def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, di
 
 def _state_objects(found: Twin) -> tuple[int, str]:
     """Count the likely objects, and state where they are."""
-    sure = [one for one in found.objects if one.existence_probability > _MIN_EXISTENCE_PROBABILITY]
-    said = [f"{len(sure)} things found, {len(found.objects) - len(sure)} doubtful ones"]
+    limit = math.inf if found.grid is None else _MAX_DEVIATION * float(found.grid.ranges[-1])
+    likely = [x for x in found.objects if x.existence_probability > _MIN_EXISTENCE_PROBABILITY]
+    sure = [one for one in likely if _position_deviation(one) <= limit]
+    count = f"{len(sure)} object{'s' * (len(sure) != 1)} found"
+    said = [f"{count}, {len(found.objects) - len(sure)} doubtful"]
     for thing in sure[:_MAX_STATED]:
         place, off = report.format_place(thing.position[:2].tolist()), _position_deviation(thing)
         said.append(f"{thing.kind} at ({place}) ± {off:.2g} m")
@@ -126,7 +130,7 @@ def _position_deviation(thing: DetectedObject) -> float:
 
 
 def _object_table(twin: Twin) -> report.ReportTable:
-    heads = ["thing", "kind", "confidence", *(f"{axis} [m]" for axis in "xyz")]
+    heads = ["object", "kind", "confidence", *(f"{axis} [m]" for axis in "xyz")]
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in twin.objects:
@@ -139,7 +143,7 @@ def _object_table(twin: Twin) -> report.ReportTable:
         share = f"{thing.kind} {thing.probabilities.get(thing.kind, 1.0):.2f}"
         row = [thing.name, share, thing.existence_probability, *thing.position.tolist()]
         rows.append([*row, _position_deviation(thing) or None, yaw, size, rate])
-    return report.ReportTable("Things", heads, rows, report.load_texts("notes")["things"])
+    return report.ReportTable("Objects", heads, rows, report.load_texts("notes")["things"])
 
 
 def _draw_maps(twin: Twin, folder: RunFolder) -> list[report.ReportPicture]:
