@@ -186,6 +186,6 @@ def test_an_object_without_a_known_place_is_doubtful():
         0.0,
         grid=bins,
     )
-    expected = "1 object found, 2 doubtful; point at (1.000, 0.000) ± 0.05 m"
+    expected = "1 object found, 2 doubtful; point at (1.00, 0.00) ± 0.05 m"
     assert _state_objects(found) == (1, expected)
     assert _state_objects(replace(found, grid=None))[0] == 2
