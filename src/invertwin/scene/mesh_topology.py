@@ -70,9 +70,9 @@ def close_cracks(
     places = separate_groups(points, groups)
     first = weld_vertices(places)
     welded = first[faces]
-    # A vertex beside the end of an edge moves there, rather than to cut a short piece off.
-    edges = find_edges(welded, places, owner, CRACK_TOLERANCE)
-    onto, open_edges, width = first[:, None], 0, 0.0
+    whole, onto, open_edges, width = _undivided(welded, places, owner), first[:, None], 0, 0.0
+    is_open = (whole.counts == 1).any()
+    edges = _split_at_vertices(whole, places, bool(is_open))
     offset = places.take(first, 0)
     offset -= places
     moves, share = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
@@ -87,8 +87,8 @@ def close_cracks(
     if (ends != first[vertex, None]).any():
         welded = weld_vertices(places)[faces]
         edges = find_edges(welded, places, owner)
-    elif (edges.counts == 1).any():
-        edges = _split_at_vertices(edges, places)
+    elif is_open:
+        edges = _split_at_vertices(whole, places)
     return welded, edges, places, Cracks(vertex, ends, share, open_edges, width)
 
 
@@ -130,8 +130,7 @@ def _find_cracks(
     along = np.zeros(len(places))
     onto[own[rest]], along[own[rest]] = others[rest], share[rest]
     left = (own[:, None] != others).all(1) & (onto[own, 0] == own)
-    width = float(gap[left].max(initial=0.0))
-    return onto[lowest], along[lowest], len(np.unique(row[left])), width
+    return onto[lowest], along[lowest], len(np.unique(row[left])), float(gap[left].max(initial=0.0))
 
 
 def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
@@ -279,7 +278,7 @@ class MeshEdges(NamedTuple):
     triangle: Int64[np.ndarray, " h"]
 
 
-def find_edges(faces: Faces, places: Points, owner: Owner = 0, shortest: float = 0.0) -> MeshEdges:
+def find_edges(faces: Faces, places: Points, owner: Owner = 0) -> MeshEdges:
     """Find the edges of triangles.
 
     Slivers and repetitions of a triangle in one object have none. A side on which vertices of
@@ -289,13 +288,17 @@ def find_edges(faces: Faces, places: Points, owner: Owner = 0, shortest: float =
         faces: welded vertices of each triangle.
         places: positions in units of the size of their group.
         owner: object of each triangle; repetitions in others count.
-        shortest: vertices that are no further from an end of the side do not divide it.
     """
+    return _split_at_vertices(_undivided(faces, places, owner), places)
+
+
+def _undivided(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
+    """Find the edges of triangles; vertices that lie on a side do not divide it."""
     whole = _sides_of(faces, np.flatnonzero(~find_slivers(places.take(faces, 0))), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
     if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
         whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
-    return _split_at_vertices(whole, places, shortest)
+    return whole
 
 
 def _sides_of(faces: Faces, number: Int64[np.ndarray, " n"], vertex_count: int) -> MeshEdges:
@@ -394,8 +397,15 @@ def find_slivers(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"
     return square * across - common**2 <= WELD_TOLERANCE**2 * longest
 
 
-def _split_at_vertices(edges: MeshEdges, places: Points, shortest: float = 0.0) -> MeshEdges:
-    """Split edges at the vertices of others that lie on them, into pieces that are not shorter."""
+def _split_at_vertices(edges: MeshEdges, places: Points, before_cracks: bool = False) -> MeshEdges:
+    """Split edges at the vertices of others that lie on them.
+
+    Args:
+        edges: edges of triangles.
+        places: positions in units of the size of their group.
+        before_cracks: True if cracks are closed next. Vertices off the edge or beside its end then
+            move onto either, rather than to stay aside or to cut a short piece off.
+    """
     # Two triangles complete an edge, except where another part of the mesh touches it.
     candidates = edges.counts != 2
     pairs = _pairs_at_edges(edges, edges.triangle)
@@ -405,7 +415,8 @@ def _split_at_vertices(edges: MeshEdges, places: Points, shortest: float = 0.0) 
             candidates[~candidates] = near_other_parts(places[edges.ends[~candidates]], part)
     rows = np.flatnonzero(candidates)
     ends = edges.ends[rows]
-    row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places)
+    tolerance, shortest = (_MAX_OFFSET, CRACK_TOLERANCE) if before_cracks else (WELD_TOLERANCE, 0.0)
+    row, vertex, share = find_vertices_on_edges(ends, np.unique(ends), places, tolerance)
     inner = (vertex[:, None] != ends[row]).all(1)
     gap = np.linalg.norm(places[vertex, None] - places[ends[row]], axis=2).min(1)
     inner &= gap > shortest

@@ -118,6 +118,21 @@ def test_cracks_are_closed_by_moving_their_vertices(share):
     assert volume == pytest.approx(0.06, rel=6 * share)
 
 
+@pytest.mark.parametrize("gap", [3e-7, 9e-7, 2e-6])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_vertices_beside_the_middle_of_an_edge_move_onto_it(gap, sign):
+    """Within the weld tolerance they stayed aside, where diffraction saw a wall cross the floor."""
+    floor = Mesh(float64([0, 0, 0], [1, 0, 0], [0, 1, 0]), torch.tensor([[0, 1, 2]]))
+    low = sign * gap * 2**0.5  # of the diagonal
+    wall = Mesh(float64([0.3, 0, low], [0.6, 0, low], [0.3, 0, 0.1]), torch.tensor([[0, 1, 2]]))
+    whole = concatenate_meshes([floor, wall])
+    shape = topology_of([whole])
+    assert shape.join_vertices([whole.vertices])[3:5, 2].abs().max() < 1e-12
+    ends = [[0, 3], [3, 4], [1, 4], [0, 2], [1, 2], [3, 5], [4, 5]]
+    assert sorted(map(sorted, shape.edges.tolist())) == sorted(ends)
+    assert (shape.edge_faces[(shape.edges == torch.tensor([3, 4])).all(1)] >= 0).all()
+
+
 def test_derivatives_flow_to_the_vertices_onto_which_others_move():
     cracked = jittered(box(0.4), 1e-5, 1)
     vertices = cracked.vertices.clone().requires_grad_()
