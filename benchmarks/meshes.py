@@ -8,10 +8,10 @@ face), `junctions` (one face of eight triangles against undivided neighbours), `
 boxes with shared planes, united), `raw` (these as they are), `doubled` (a face twice, along both
 diagonals), `inside_out`, `mixed` (every third triangle turned), `cracked` (by 1e-9 m), `soup`
 (three float32 corners a triangle, as in an STL file), `jittered` (these up to 1e-5 of the size
-apart), `shaken panels` (as many, six objects). Of a car, a chair and a room (`bodies.py`): `file` (a float32 STL, loaded), `raw` (all parts
-in one mesh) and `objects` (each part one). Of a wall on part of a floor's edge: `raw`, `objects`,
-and both with the wall 1e-9 m below the floor (`sunk`) or above. Prints tables and writes
-`metrics.json` into DIR (default `out/meshes`):
+apart), `shaken panels` (as far apart, six objects). Of a car, a chair and a room (`bodies.py`):
+`file` (a float32 STL, loaded), `raw` (all parts in one mesh) and `objects` (each part one). Of a
+wall on part of a floor's edge: `raw`, `objects`, and both with the wall 1e-9 m below the floor
+(`sunk`) or above. Prints tables and writes `metrics.json` into DIR (default `out/meshes`):
 
 - `value.<mechanism>.<mesh>`, `derivative.<mechanism>.<mesh>`: ⟨a, b⟩/⟨b, b⟩ of a quantity a and
   that of the clean mesh, b; its derivative is with respect to a translation that turns.
