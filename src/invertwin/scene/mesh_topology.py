@@ -70,7 +70,7 @@ def close_cracks(
     places = separate_groups(points, groups)
     first = weld_vertices(places)
     welded = first[faces]
-    whole, onto, open_edges, width = _undivided(welded, places, owner), first[:, None], 0, 0.0
+    whole, onto, open_edges, width = _whole_edges(welded, places, owner), first[:, None], 0, 0.0
     is_open = (whole.counts == 1).any()
     edges = _split_at_vertices(whole, places, bool(is_open))
     offset = places.take(first, 0)
@@ -289,10 +289,10 @@ def find_edges(faces: Faces, places: Points, owner: Owner = 0) -> MeshEdges:
         places: positions in units of the size of their group.
         owner: object of each triangle; repetitions in others count.
     """
-    return _split_at_vertices(_undivided(faces, places, owner), places)
+    return _split_at_vertices(_whole_edges(faces, places, owner), places)
 
 
-def _undivided(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
+def _whole_edges(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
     """Find the edges of triangles; vertices that lie on a side do not divide it."""
     whole = _sides_of(faces, np.flatnonzero(~find_slivers(places.take(faces, 0))), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
