@@ -12,8 +12,8 @@ from typing import NamedTuple, TypeAlias
 
 import igl
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
+from jaxtyping import Bool, Float64, Int, Int64
+from scipy.sparse import coo_array, diags_array, find
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -31,6 +31,7 @@ _MAX_PARTS = 2000  # whose boxes are compared in pairs
 _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MAX_CRACK_SHARE = 1e-3  # of the edges on both sides: width of the widest cracks that are closed
 _MAX_OFFSET = 1e-7  # of welded vertices that need not move, relative to the size
+_DOUBLINGS = 6  # of the steps in which vertices approach their edges: (2/3)⁶⁴ is left
 _MIN_PARALLEL_COSINE = 0.995  # of these edges
 _MAX_FOLD_COSINE = 0.985  # of surfaces that go on across a crack, unlike sheets side by side
 
@@ -40,15 +41,17 @@ class Cracks(NamedTuple):
 
     Attributes:
         vertex: number of each of them.
-        ends: vertices at the ends of its edge, or the vertex onto which it moves.
-        share: position on the edge, 0 to 1.
+        row: which of these each weight is of.
+        column: vertex that has the weight.
+        weight: shares of vertices in the new position.
         open_edges: number of open edges that run beside others, across cracks too wide to close.
         width: of the widest of these, in units of the size of the group.
     """
 
     vertex: Int64[np.ndarray, " n"]
-    ends: Int64[np.ndarray, "n k"]
-    share: Float64[np.ndarray, " n"]
+    row: Int[np.ndarray, " weight"]
+    column: Int[np.ndarray, " weight"]
+    weight: Float64[np.ndarray, " weight"]
     open_edges: int
     width: float
 
@@ -75,21 +78,28 @@ def close_cracks(
     edges = _split_at_vertices(whole, places, bool(is_open))
     offset = places.take(first, 0)
     offset -= places
-    moves, share = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
+    moves, along = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
     if (edges.counts == 1).any():
-        onto, share, open_edges, width = _find_cracks(edges, places)
-        onto, share = onto[first], share[first]
+        onto, along, open_edges, width = _find_cracks(edges, places)
+        onto, along = onto[first], along[first]
         moves |= (onto != first[:, None]).any(1)
-    vertex = np.flatnonzero(moves)
-    ends, share = onto[vertex], share[vertex]
-    start, end = places[ends[:, 0]], places[ends[:, -1]]
-    places[vertex] = start + share[:, None] * (end - start)
-    if (ends != first[vertex, None]).any():
+    vertex, count = np.flatnonzero(moves), len(places)
+    is_closing, share = (onto[vertex] != first[vertex, None]).any(), along[vertex]
+    row, column = np.repeat(np.arange(len(vertex)), 2), onto[vertex][:, [0, -1]].ravel()
+    weight = np.stack([1 - share, share], 1).ravel()
+    if moves[column].any():  # parts side by side divide each other's edges: they meet on one line
+        shares = coo_array((weight, (vertex[row], column)), shape=(count, count)).tocsr()
+        shares += diags_array(1.0 * ~moves)
+        for _ in range(_DOUBLINGS):
+            shares = shares @ shares
+        row, column, weight = find(shares[vertex])
+    places[vertex] = coo_array((weight, (row, column)), shape=(len(vertex), count)) @ places
+    if is_closing:
         welded = weld_vertices(places)[faces]
         edges = find_edges(welded, places, owner)
     elif is_open:
         edges = _split_at_vertices(whole, places)
-    return welded, edges, places, Cracks(vertex, ends, share, open_edges, width)
+    return welded, edges, places, Cracks(vertex, row, column, weight, open_edges, width)
 
 
 def _find_cracks(
@@ -123,10 +133,8 @@ def _find_cracks(
     chain = label_components(np.stack([vertex, nearest], 1)[at_end], len(places))
     lowest = np.unique(chain, return_index=True)[1][chain]
     onto, own, others = np.stack([lowest, lowest], 1), lowest[vertex], lowest[ends[row]]
-    # An edge onto which a vertex moves stays where it is; of several edges, the nearest counts.
-    rest = np.argsort(-gap, kind="stable")
+    rest = np.argsort(-gap, kind="stable")  # of several edges, the nearest counts
     rest = rest[((gap <= reach) & ~at_end)[rest]]
-    rest = rest[~np.isin(others[rest], own[rest]).any(1)]
     along = np.zeros(len(places))
     onto[own[rest]], along[own[rest]] = others[rest], share[rest]
     left = (own[:, None] != others).all(1) & (onto[own, 0] == own)

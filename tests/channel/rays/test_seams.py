@@ -133,6 +133,34 @@ def test_vertices_beside_the_middle_of_an_edge_move_onto_it(gap, sign):
     assert (shape.edge_faces[(shape.edges == torch.tensor([3, 4])).all(1)] >= 0).all()
 
 
+@pytest.mark.parametrize("gap", [5e-7, 3e-6, 3e-5])
+def test_panels_that_divide_each_other_meet_on_one_line(gap):
+    """Each shared corner of two panels lies beside the middle of an edge of the others."""
+
+    def panel(left, right, up):
+        corners = [[left, 0, 0], [right, 0, 0], [right, 0, 1], [left, 0, 1]]
+        vertices = float64(*corners) * float64(1, 1, 1 if up else -1)
+        return Mesh(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+
+    parts = [panel(*p) for p in ((0, 1, 1), (1, 2, 1), (0, 0.6, 0), (0.6, 1.5, 0), (1.5, 2, 0))]
+    generator = torch.Generator().manual_seed(2)
+    shaken = [
+        Mesh(p.vertices + gap * torch.rand(3, generator=generator).double(), p.faces) for p in parts
+    ]
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    points = [p.vertices + shift for p in shaken]
+    shape = topology_of(shaken, points)
+    met = ((shape.edge_faces >= 0).sum(1) == 2).sum()
+    assert met == 5 + 4 + 3  # diagonals, pieces of the line, sides of neighbours
+    moved = shape.join_vertices(points)
+    seam = moved[moved[:, 2].abs() < 0.1]
+    line = torch.lerp(seam[:1], seam[seam[:, 0].argmax()][None], seam[:, :1] / 2)
+    # Copies of a vertex need not move within 1e-7 of the size, which is 2.8 m.
+    assert float((seam - line).detach()[:, 1:].abs().max()) < 2.8e-7
+    (slope,) = torch.autograd.grad(seam.sum(), shift)
+    assert slope.tolist() == pytest.approx([len(seam)] * 3)
+
+
 def test_derivatives_flow_to_the_vertices_onto_which_others_move():
     cracked = jittered(box(0.4), 1e-5, 1)
     vertices = cracked.vertices.clone().requires_grad_()

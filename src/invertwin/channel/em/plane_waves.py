@@ -8,7 +8,7 @@ batched over rows; fields have one row per polarisation of the incident wave.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from invertwin.scene.material.fresnel import LEAST_COSINE
 
+Waves: TypeAlias = Complex128[Tensor, "row 2 3"]
 Vectors = Float64[Tensor, "*row 3"]
 
 
@@ -99,8 +100,8 @@ def reflect_field(
     wave_number: float,
     normal: Vectors,
     direction: Vectors,
-    field: Complex128[Tensor, "row 2 3"],
-) -> Complex128[Tensor, "row 2 3"]:
+    field: Waves,
+) -> Waves:
     """Coherently reflected field on the surface; for a conductor 2(n·E)n − E.
 
     For a dielectric, the s and p components are multiplied by the Fresnel coefficients. Roughness
@@ -144,9 +145,9 @@ def radiate_field(
     wave_number: float,
     normal: Vectors,
     direction: Vectors,
-    field: Complex128[Tensor, "row 2 3"],
+    field: Waves,
     scattered_direction: Vectors,
-) -> Complex128[Tensor, "row 2 3"]:
+) -> Waves:
     """Far field F per m² of an illuminated surface, radiated by its currents.
 
     Currents of the reflected wave on the surface, ηJ = n × (d×E + d_r×E_r) and M = −n × (E + E_r),
@@ -174,9 +175,7 @@ def radiate_field(
     return project_transverse(total * attenuation[:, None, None], scattered_direction)
 
 
-def project_transverse(
-    field: Complex128[Tensor, "row 2 3"], direction: Vectors
-) -> Complex128[Tensor, "row 2 3"]:
+def project_transverse(field: Waves, direction: Vectors) -> Waves:
     """Remove the longitudinal component of fields.
 
     Args:
@@ -191,10 +190,10 @@ def radiate_currents(
     wave_number: float,
     normal: Vectors,
     wave_vector: Tensor,
-    field: Complex128[Tensor, "row 2 3"],
-    reflected_field: Complex128[Tensor, "row 2 3"],
+    field: Waves,
+    reflected_field: Waves,
     scattered_direction: Vectors,
-) -> Complex128[Tensor, "row 2 3"]:
+) -> Waves:
     """Radiation −(jk/4π) [ηJ − s × M] per m² of the currents of an incident and a reflected wave.
 
     A wave along K, with ηH = K × E, and its reflection have ηJ = n × (K×E + K_r×E_r) and M = −n ×

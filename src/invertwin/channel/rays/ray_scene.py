@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -26,6 +26,8 @@ from invertwin.scene.mesh import Mesh
 
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and so small
 # that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
+
+Points: TypeAlias = Float64[Tensor, "n 3"]
 RAY_EPSILON = 3e-6
 _MAX_SHEETS = 8  # that a segment may pass
 _MIN_RELATIVE_AREA = 1e-3  # least area over squared sides of a triangle that is not a sliver
@@ -139,7 +141,7 @@ class Occluders:
         dr.eval(face, distance)
         return arrays.to_torch(face).long(), arrays.to_torch(distance).double()
 
-    def to_local_points(self, points: Float64[Tensor, "n 3"]) -> mit.Point3f:
+    def to_local_points(self, points: Points) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""
         pairs = zip(points.detach().unbind(1), self.origin, strict=True)
         return mi.Point3f(*(arrays.to_float(column - start) for column, start in pairs))
@@ -298,9 +300,7 @@ def face_areas(geometry: Geometry) -> Float64[Tensor, " f"]:
     return areas
 
 
-def is_visible(
-    rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
-) -> Tensor:
+def is_visible(rays: Occluders, start: Points, end: Points) -> Tensor:
     """Test whether segments between world points are unobstructed.
 
     Args:
@@ -315,7 +315,7 @@ def is_visible(
 
 
 def find_next_surface(
-    rays: Occluders, start: Float64[Tensor, "n 3"], end: Float64[Tensor, "n 3"]
+    rays: Occluders, start: Points, end: Points
 ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
     """Find the first triangle between pairs of world points.
 
@@ -338,10 +338,7 @@ def find_next_surface(
 
 
 def find_passed_sheets(
-    rays: Occluders,
-    start: Float64[Tensor, "n 3"],
-    end: Float64[Tensor, "n 3"],
-    sheets: Bool[Tensor, " f"],
+    rays: Occluders, start: Points, end: Points, sheets: Bool[Tensor, " f"]
 ) -> tuple[Bool[Tensor, " n"], list[tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]]]:
     """Find the sheets between pairs of world points.
 
@@ -368,9 +365,7 @@ def find_passed_sheets(
     return clear, passed
 
 
-def visible_points(
-    mesh: Mesh, points: Float64[Tensor, "n 3"], positions: ArrayLike
-) -> Bool[Tensor, " n"]:
+def visible_points(mesh: Mesh, points: Points, positions: ArrayLike) -> Bool[Tensor, " n"]:
     """Find the points of a surface that at least one position sees past the rest of the mesh.
 
     Args:

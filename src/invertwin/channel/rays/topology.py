@@ -57,7 +57,7 @@ class Topology:
         welded, edges, places, cracks = mesh_topology.close_cracks(
             vertices.numpy(), faces.numpy(), groups[owner.numpy()], face_object.numpy()
         )
-        self._moves = [torch.from_numpy(column) for column in cracks[:3]]
+        self._moves = [torch.from_numpy(column) for column in cracks[:4]]
         if cracks.open_edges:
             warnings.warn(
                 f"{cracks.open_edges} edges of meshes run along cracks of up to {cracks.width:.2g} "
@@ -102,10 +102,10 @@ class Topology:
         Args:
             parts: positions of each object, with derivatives [m].
         """
-        points, (vertex, ends, share) = torch.cat(list(parts)), self._moves
+        points, (vertex, row, column, weight) = torch.cat(list(parts)), self._moves
         if not len(vertex):
             return points
-        moved = torch.lerp(points[ends[:, 0]], points[ends[:, -1]], share[:, None])
+        moved = points.new_zeros(len(vertex), 3).index_add(0, row, weight[:, None] * points[column])
         return points.index_put((vertex,), moved)
 
     @cached_property

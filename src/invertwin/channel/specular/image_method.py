@@ -13,7 +13,7 @@ Source: derivations §10.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -35,9 +35,8 @@ from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows
 
+Vectors: TypeAlias = Float64[Tensor, "row 3"]
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
-
-
 DIRECT = torch.zeros(1, 0, dtype=torch.int64)
 """The sequence without steps, of the line of sight."""
 _LANES = 1 << 19
@@ -84,9 +83,7 @@ class CandidateSurfaces(Occluders):
         height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
         return arrays.to_float(self.margin / height.clamp_min(1e-300))
 
-    def images(
-        self, positions: Float64[Tensor, "row 3"], steps: Int64[Tensor, "row step"]
-    ) -> list[Float64[Tensor, "row 3"]]:
+    def images(self, positions: Vectors, steps: Int64[Tensor, "row step"]) -> list[Vectors]:
         """Images of positions after each step of sequences, relative to the local origin [m].
 
         Args:
@@ -118,11 +115,11 @@ class SpecularPaths(Rows):
 
 
 def image_positions(
-    position: Float64[Tensor, "row 3"],
+    position: Vectors,
     point: Float64[Tensor, "row step 3"],
     normal: Float64[Tensor, "row step 3"],
     transmitted: Bool[Tensor, "row step"],
-) -> list[Float64[Tensor, "row 3"]]:
+) -> list[Vectors]:
     """Positions of a source and of its images after each step.
 
     Args:
@@ -148,11 +145,11 @@ def replace_zeros(values: Tensor) -> Tensor:
 
 
 def interaction_points(
-    target: Float64[Tensor, "row 3"],
-    images: list[Float64[Tensor, "row 3"]],
+    target: Vectors,
+    images: list[Vectors],
     point: Float64[Tensor, "row step 3"],
     normal: Float64[Tensor, "row step 3"],
-) -> list[Float64[Tensor, "row 3"]]:
+) -> list[Vectors]:
     """Intersection points of paths with the planes, from the source on.
 
     Args:
@@ -187,7 +184,7 @@ class UnfoldedPaths:
         topology: Topology,
         faces: Int64[Tensor, "row step"],
         transmitted: Bool[Tensor, "row step"],
-        source: Float64[Tensor, "row 3"],
+        source: Vectors,
     ) -> None:
         corners = vertices[topology.faces[faces]]
         self.faces, self.transmitted = faces, transmitted
@@ -195,11 +192,11 @@ class UnfoldedPaths:
         self.images = image_positions(source, self.point, self.normal, transmitted)
 
     @property
-    def image(self) -> Float64[Tensor, "row 3"]:
+    def image(self) -> Vectors:
         """Image of the source in all surfaces [m]."""
         return self.images[-1]
 
-    def interaction_points(self, target: Float64[Tensor, "row 3"]) -> Tensor:
+    def interaction_points(self, target: Vectors) -> Tensor:
         """Interaction points of the paths to targets, [row, step, 3] [m].
 
         Args:
@@ -208,7 +205,7 @@ class UnfoldedPaths:
         found = interaction_points(target, self.images, self.point, self.normal)
         return torch.stack(found, 1) if found else self.point
 
-    def directions(self, target: Float64[Tensor, "row 3"]) -> list[Float64[Tensor, "row 3"]]:
+    def directions(self, target: Vectors) -> list[Vectors]:
         """Unit vectors of the legs to targets, from the source on.
 
         Args:
@@ -400,8 +397,8 @@ class _SpecularSegments(Rows):
 def intersects_planes(
     surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "row step"],
-    images: list[Float64[Tensor, "row 3"]],
-    target: Float64[Tensor, "row 3"],
+    images: list[Vectors],
+    target: Vectors,
 ) -> Bool[Tensor, " row"]:
     """Test if lines to the images intersect the planes within their rectangles, in order.
 
@@ -430,8 +427,8 @@ def intersects_planes(
 def find_unobstructed_paths(
     surfaces: CandidateSurfaces,
     steps: Int64[Tensor, "row step"],
-    source: Float64[Tensor, "row 3"],
-    targets: Float64[Tensor, "row 3"],
+    source: Vectors,
+    targets: Vectors,
     target_planes: Int64[Tensor, " row"] | None = None,
 ) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
     """Find unobstructed paths along given planes, and the triangles of their interactions.
@@ -462,7 +459,7 @@ def find_unobstructed_paths(
 
 
 def is_unobstructed(
-    surfaces: CandidateSurfaces, start: Float64[Tensor, "row 3"], end: Float64[Tensor, "row 3"]
+    surfaces: CandidateSurfaces, start: Vectors, end: Vectors
 ) -> Bool[Tensor, " row"]:
     """Mask of unobstructed straight lines.
 
