@@ -69,16 +69,14 @@ class Topology:
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
         tables = edge_tables(edges, places, face_object.numpy())
         # Of each object, side by side: samples that follow this order are spread over its surface.
-        start, end = (vertices[ends] for ends in tables[0].T)
-        order = torch.from_numpy(morton_order((start + end).numpy()))
-        of = owner[tables[0][order, 0]].numpy()
-        order = order[mesh_topology.sort_rows(of, count=len(groups))[0]]
+        start, end = tables[0].T
+        order = torch.from_numpy(morton_order((vertices[start] + vertices[end]).numpy()))
+        order = order[mesh_topology.sort_rows(owner[start[order]].numpy(), count=len(groups))[0]]
         self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
         beside = self.edge_faces
         self.open_objects = _open_objects(beside, face_object)
-        unshared = face_object[beside[beside[:, 1] < 0, 0]]
         #: Open objects that others close: panels of a body.
-        self.panels = self.open_objects - set(unshared.tolist())
+        self.panels = self.open_objects - set(face_object[beside[beside[:, 1] < 0, 0]].tolist())
         self.faces = faces = _turn_outwards(faces, welded, face_object, places, self.open_objects)
         self.device_faces = to_index(faces)
         #: The same, four numbers each, the last one zero: each is read as a whole.
@@ -250,12 +248,14 @@ def _turn_outwards(
 ) -> Int64[Tensor, "f 3"]:
     """Triangles of closed objects with outward normals, all others as they are."""
     inward = torch.zeros(len(faces), dtype=torch.bool)
-    rows = face_object.argsort(stable=True).split(face_object.bincount().tolist())
-    for number in set(range(len(rows))) - open_objects:
-        own = welded[rows[number].numpy()]
-        # Among the vertices of all objects, each one would take the time of all.
-        turned = mesh_topology.find_inward_faces(own - own.min(), places[own.min() : own.max() + 1])
-        inward[rows[number]] = torch.from_numpy(turned)
+    counts = face_object.bincount().tolist()  # objects follow each other
+    parts = zip(torch.from_numpy(welded).split(counts), inward.split(counts), strict=True)
+    for number, (own, turned) in enumerate(parts):
+        if number not in open_objects:
+            # Among the vertices of all objects, each one would take the time of all.
+            low, high = int(own.min()), int(own.max())
+            found = mesh_topology.find_inward_faces((own - low).numpy(), places[low : high + 1])
+            turned.copy_(torch.from_numpy(found))
     return torch.where(inward[:, None], faces.flip(1), faces)
 
 
