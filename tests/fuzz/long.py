@@ -5,8 +5,8 @@
 Every format is read in turns by processes of their own, two at a time. `metrics.json` in DIR
 (default `out/fuzz`) counts `cases` and `failures`, in all and per format; the files of a failure
 are kept in DIR/<format>-<number>. Files that the libraries wrote are read in the process of the
-fuzz, those of users in a child: if the process dies of one, it is read again as a user's, and a
-failure if that fails too, else one of `deaths`.
+fuzz, those of users in a child: if a signal ends the process, the case is read again as a user's,
+and a failure if that fails too, else one of `deaths`.
 """
 
 import argparse
@@ -108,6 +108,14 @@ def read_again(name: str, seed: int, edits: list[Any]) -> str | None:
     return None if found is None else f"{found.what} at {found.where}"
 
 
+def is_read_well(call: list[str], environment: dict[str, str]) -> bool:
+    """Whether one case is read as a user's in a process of its own, in time."""
+    try:
+        return not subprocess.run(call, env=environment, timeout=_LATE).returncode
+    except subprocess.TimeoutExpired:
+        return False
+
+
 def turn(name: str, seconds: float, seed: int, out: Path) -> dict[str, Any]:
     """Cases of one format, in a process that may die of them."""
     folder = out / f"{name}-{seed}"
@@ -127,9 +135,10 @@ def turn(name: str, seconds: float, seed: int, out: Path) -> dict[str, Any]:
         kept = last.read_text() if last.exists() else ""  # empty, if it died of writing it
         cases, edits = json.loads(kept) if kept else (0, None)
         died = {"what": said or str(error)[-200:], "count": 1, "edits": [edits]}
-        again = edits and [*call[:3], "--again", json.dumps(edits), "--work", name]
-        passes = again and not subprocess.run(again, env=environment, timeout=_LATE).returncode
-        found = {"cases": cases + 1, "slowest_seconds": 0.0, "deaths": int(bool(passes))}
+        again = [*call[:3], "--again", json.dumps(edits), "--work", name]
+        is_crash = edits is not None and said.startswith("exit code -")  # no hang
+        passes = is_crash and is_read_well(again, environment)
+        found = {"cases": cases + 1, "slowest_seconds": 0.0, "deaths": int(passes)}
         found["failures"] = {} if passes else {"died": died}
     (folder / "case.json").unlink(missing_ok=True)
     folder.rmdir()
