@@ -101,8 +101,7 @@ def table(metrics: dict[str, Any]) -> MetricTable:
         f"load {metrics['load_average']:.1f}"
     )
     shown = MetricTable(title, REQUIRED)
-    for key, (form, text) in COUNTED.items():
-        shown.row(key, metrics[key], form, text)
+    shown.rows(metrics, COUNTED)
     return shown
 
 

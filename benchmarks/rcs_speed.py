@@ -102,8 +102,7 @@ def table(metrics: dict[str, Any]) -> MetricTable:
     """A row a metric."""
     title = f"RCS of a corner, backend {metrics['backend']}, load {metrics['load_average']:.1f}"
     shown = MetricTable(title, REQUIRED)
-    for key, (form, text) in COUNTED.items():
-        shown.row(key, metrics[key], form, text)
+    shown.rows(metrics, COUNTED)
     return shown
 
 

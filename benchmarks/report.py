@@ -30,6 +30,11 @@ class MetricTable:
         cell = "—" if value is None else format(value, shown)
         self.grid.add_row(key, cell, "" if limit is None else verdict(value, limit), escape(text))
 
+    def rows(self, metrics: dict[str, Any], counted: dict[str, tuple[str, str]]) -> None:
+        """Add metrics, each with the format of its value and what was counted."""
+        for key, (shown, text) in counted.items():
+            self.row(key, metrics[key], shown, text)
+
 
 def verdict(value: float | None, limit: tuple[str, float]) -> str:
     """What must hold of a value, and whether it does."""

@@ -74,8 +74,8 @@ def close_cracks(
     first = weld_vertices(places)
     welded = first[faces]
     whole, onto, open_edges, width = _whole_edges(welded, places, owner), first[:, None], 0, 0.0
-    is_open = (whole.counts == 1).any()
-    edges = _split_at_vertices(whole, places, bool(is_open))
+    is_open = bool((whole.counts == 1).any())
+    edges = _split_at_vertices(whole, places, is_open)
     offset = places.take(first, 0)
     offset -= places
     moves, along = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0

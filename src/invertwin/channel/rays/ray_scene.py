@@ -24,10 +24,9 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh
 
+Points: TypeAlias = Float64[Tensor, "n 3"]
 # Offset along a ray, relative to its length: fifty float32 roundings of a coordinate, and so small
 # that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
-
-Points: TypeAlias = Float64[Tensor, "n 3"]
 RAY_EPSILON = 3e-6
 _MAX_SHEETS = 8  # that a segment may pass
 _MIN_RELATIVE_AREA = 1e-3  # least area over squared sides of a triangle that is not a sliver

@@ -60,9 +60,8 @@ def find_rigid_groups(
         contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b]))
         if len(contacts) > 1:
             pairs.append((a, b))
-            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()] / max(
-                size[[a, b]]
-            )
+            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()]
+            points = points / float(size[[a, b]].max())
             gaps.append((points[:, 0], torch.lerp(points[:, 1], points[:, 2], contacts[:, 3:])))
     # One comparison for all pairs, as a rule; else one for each.
     if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
