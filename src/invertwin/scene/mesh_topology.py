@@ -8,6 +8,7 @@ only where no other triangle continues it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple, TypeAlias
 
 import igl
@@ -24,6 +25,7 @@ CRACK_TOLERANCE = 1e-4
 
 Points: TypeAlias = Float64[np.ndarray, "v 3"]
 Faces: TypeAlias = Int64[np.ndarray, "f 3"]
+Numbers: TypeAlias = Int64[np.ndarray, " n"]
 Groups: TypeAlias = Int64[np.ndarray, " v"]
 Owner: TypeAlias = Int64[np.ndarray, " f"] | int  # object of each triangle
 _LINE = 0.8191, 0.4731, 0.3244  # a direction across no planes that people draw
@@ -48,7 +50,7 @@ class Cracks(NamedTuple):
         width: of the widest of these, in units of the size of the group.
     """
 
-    vertex: Int64[np.ndarray, " n"]
+    vertex: Numbers
     row: Int[np.ndarray, " weight"]
     column: Int[np.ndarray, " weight"]
     weight: Float64[np.ndarray, " weight"]
@@ -165,13 +167,17 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     return welded
 
 
-def sort_order(numbers: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+def sort_order(numbers: Numbers) -> Numbers:
     """Return the stable order of numbers below 2⁶³ over twice their count.
 
     Their places stand below them in one number each: nine times faster than a stable sort.
     """
     bits = len(numbers).bit_length()
-    return np.sort(numbers << bits | np.arange(len(numbers))) & (1 << bits) - 1
+    order = numbers << bits
+    order |= np.arange(len(numbers))  # in place: new memory costs as much as the sort
+    order.sort()
+    order &= (1 << bits) - 1
+    return order
 
 
 def _find_close_pairs(places: Points, along: Float64[np.ndarray, " v"]) -> Int64[np.ndarray, "n 2"]:
@@ -187,9 +193,7 @@ def _find_close_pairs(places: Points, along: Float64[np.ndarray, " v"]) -> Int64
     return np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
 
 
-def sort_rows(
-    *columns: Int64[np.ndarray, " n"], count: int
-) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " u"]]:
+def sort_rows(*columns: Numbers, count: int) -> tuple[Numbers, Int64[np.ndarray, " u"]]:
     """Return the stable order of rows, and where in it runs of equal ones begin.
 
     Args:
@@ -197,14 +201,13 @@ def sort_rows(
         count: more than all numbers.
     """
     size, bits = len(columns[0]), count.bit_length()
-    order = np.arange(size)
     if count == 1:
-        return order, order[:1]
+        return np.arange(size), np.arange(min(size, 1))
     held = max(1, (63 - size.bit_length()) // bits)  # columns that one number holds
-    for end in range(len(columns), 0, -held):
-        code, *rest = columns[max(0, end - held) : end]
-        for column in rest:
-            code = code << bits | column
+    parts = [columns[max(0, end - held) : end] for end in range(len(columns), 0, -held)]
+    codes = (reduce(lambda code, column: code << bits | column, part) for part in parts)
+    order = sort_order(next(codes))
+    for code in codes:
         order = order.take(sort_order(code.take(order)))
     return order, _find_runs([column.take(order) for column in columns])
 
@@ -309,14 +312,14 @@ def _whole_edges(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
     return whole
 
 
-def _sides_of(faces: Faces, number: Int64[np.ndarray, " n"], vertex_count: int) -> MeshEdges:
+def _sides_of(faces: Faces, number: Numbers, vertex_count: int) -> MeshEdges:
     """Group the sides of some triangles by edges."""
     used = faces[number]
     apex = used[:, [2, 0, 1]].T.ravel()
     return _group_sides(triangle_sides(used), apex, np.tile(number, 3), vertex_count)
 
 
-def find_distinct_faces(faces: Faces, places: Points, owner: Owner = 0) -> Int64[np.ndarray, " n"]:
+def find_distinct_faces(faces: Faces, places: Points, owner: Owner = 0) -> Numbers:
     """Return the numbers of triangles that are neither slivers nor repetitions in one object.
 
     Args:
@@ -354,7 +357,7 @@ def merge_doubled_sides(edges: MeshEdges, places: Points, owner: Owner = 0) -> M
 
 def _sort_around_edges(
     edges: MeshEdges, places: Points, least: int = 3
-) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+) -> tuple[Numbers, Numbers, Numbers]:
     """Sort the half edges at edges of some and more by angle: number, edge and half plane.
 
     Half planes are numbered in the order of the angle, one edge after the other.
@@ -378,10 +381,7 @@ def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 
 
 def _group_sides(
-    ends: Int64[np.ndarray, "h 2"],
-    apex: Int64[np.ndarray, " h"],
-    triangle: Int64[np.ndarray, " h"],
-    vertex_count: int,
+    ends: Int64[np.ndarray, "n 2"], apex: Numbers, triangle: Numbers, vertex_count: int
 ) -> MeshEdges:
     low, high = (pick(*ends.T) for pick in (np.minimum, np.maximum))
     order, start = sort_rows(low, high, count=vertex_count)
@@ -498,7 +498,7 @@ def _pairs_of_bodies(
 
 
 def near_other_parts(
-    corners: Float64[np.ndarray, "n corner 3"], part: Int64[np.ndarray, " n"]
+    corners: Float64[np.ndarray, "n corner 3"], part: Numbers
 ) -> Bool[np.ndarray, " n"]:
     """Mask of edges or triangles whose boxes meet those of other parts.
 
@@ -526,7 +526,7 @@ def find_vertices_on_edges(
     vertices: Int64[np.ndarray, " c"],
     places: Points,
     tolerance: float = WELD_TOLERANCE,
-) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+) -> tuple[Numbers, Numbers, Float64[np.ndarray, " n"]]:
     """Return edge, vertex and position along the edge, 0 to 1, of vertices that lie on edges.
 
     Args:
