@@ -21,14 +21,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.em.plane_waves import (
-    barycentric_coordinates,
-    cross,
-    dot,
-    orthogonal_unit_vectors,
-    reflect_vectors,
-    triangle_normals,
-)
+from invertwin.channel.em import plane_waves as waves
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
@@ -130,7 +123,7 @@ def image_positions(
     found = [position]
     for step in range(point.shape[1]):
         n, p = normal[:, step], point[:, step]
-        reflected = p + reflect_vectors(found[-1] - p, n)
+        reflected = p + waves.reflect_vectors(found[-1] - p, n)
         found.append(torch.where(transmitted[:, step, None], found[-1], reflected))
     return found
 
@@ -161,7 +154,7 @@ def interaction_points(
     position = target
     for step in reversed(range(point.shape[1])):
         n, direction = normal[:, step], images[step + 1] - position
-        fraction = dot(point[:, step] - position, n) / replace_zeros(dot(direction, n))
+        fraction = waves.dot(point[:, step] - position, n) / replace_zeros(waves.dot(direction, n))
         position = position + fraction[:, None] * direction
         found.insert(0, position)
     return found
@@ -188,7 +181,7 @@ class UnfoldedPaths:
     ) -> None:
         corners = vertices[topology.faces[faces]]
         self.faces, self.transmitted = faces, transmitted
-        self.normal, self.point = triangle_normals(corners), corners[..., 0, :]
+        self.normal, self.point = waves.triangle_normals(corners), corners[..., 0, :]
         self.images = image_positions(source, self.point, self.normal, transmitted)
 
     @property
@@ -213,7 +206,7 @@ class UnfoldedPaths:
         """
         found = [normalize(target - self.image, dim=1)]
         for step in reversed(range(self.normal.shape[1])):
-            reflected = reflect_vectors(found[0], self.normal[:, step])
+            reflected = waves.reflect_vectors(found[0], self.normal[:, step])
             found.insert(0, torch.where(self.transmitted[:, step, None], found[0], reflected))
         return found
 
@@ -412,8 +405,8 @@ def intersects_planes(
     point, normal = planes.point[plane], planes.normal[plane]
     nodes = torch.stack([*interaction_points(target, images, point, normal), target], 1)
     start, ray = nodes[:, 1:], torch.stack(images, 1)[:, 1:] - nodes[:, 1:]
-    slope, length = dot(ray, normal), ray.norm(dim=2)
-    distance = dot(point - start, normal) / replace_zeros(slope) * length
+    slope, length = waves.dot(ray, normal), ray.norm(dim=2)
+    distance = waves.dot(point - start, normal) / replace_zeros(slope) * length
     at = torch.einsum("rsx,rsax->rsa", nodes[:, :-1] - point, planes.axes[plane])
     inside = (at >= planes.low[plane] - surfaces.margin) & (
         at <= planes.high[plane] + surfaces.margin
@@ -475,8 +468,8 @@ def _test_segments(
 ) -> tuple[Tensor, Tensor]:
     """Return the triangle at the end of each segment, and a mask of unobstructed segments."""
     unit = normalize(segments.end - segments.start, dim=1)
-    first = orthogonal_unit_vectors(unit)
-    second = cross(unit, first)
+    first = waves.orthogonal_unit_vectors(unit)
+    second = waves.cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
     faces, end_plane = torch.full_like(votes, -1), segments.plane.maximum(segments.target_plane)
     for number in range(4):  # the last ray is not shifted
@@ -502,9 +495,9 @@ def _shift_in_plane(
 ) -> Tensor:
     """Project an offset along the segment into the plane at its end."""
     normal = surfaces.planes.normal[plane.clamp_min(0)]
-    slope = dot(direction, normal)
+    slope = waves.dot(direction, normal)
     steep = (plane >= 0) & (slope.abs() > 0.02)
-    distance = torch.where(steep, dot(offset, normal) / torch.where(steep, slope, 1.0), 0.0)
+    distance = torch.where(steep, waves.dot(offset, normal) / torch.where(steep, slope, 1.0), 0.0)
     return offset - distance[:, None] * direction
 
 
@@ -517,9 +510,11 @@ def _cast_rays(
     length = direction_vector.norm(dim=1)
     unit = normalize(direction_vector, dim=1)
     before = planes.normal[segments.plane_before.clamp_min(0)]
-    offset = torch.where(segments.plane_before >= 0, margin * dot(unit, before).sign(), 0.0)
+    offset = torch.where(segments.plane_before >= 0, margin * waves.dot(unit, before).sign(), 0.0)
     end_plane = torch.maximum(segments.plane, segments.target_plane)
-    excess = 2 * margin / dot(unit, planes.normal[end_plane.clamp_min(0)]).abs().clamp_min(1e-3)
+    excess = (
+        2 * margin / waves.dot(unit, planes.normal[end_plane.clamp_min(0)]).abs().clamp_min(1e-3)
+    )
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
     origin = arrays.to_vectors(mi.Point3f, start + offset[:, None] * before)
     direction = arrays.to_vectors(mi.Vector3f, unit)
@@ -540,7 +535,7 @@ def _test_exactly(
     planes, vertices = surfaces.planes, surfaces.exact_vertices
     corners = vertices[surfaces.topology.faces]
     a, b, c = corners.unbind(1)
-    area = cross(b - a, c - a)
+    area = waves.cross(b - a, c - a)
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces = torch.full((len(valid),), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
@@ -550,11 +545,11 @@ def _test_exactly(
         start, end = segments.start[row, None], segments.end[row, None]
         direction = end - start
         length = direction.norm(dim=2)
-        slope = dot(direction, area)
-        fraction = dot(a - start, area) / replace_zeros(slope)
+        slope = waves.dot(direction, area)
+        fraction = waves.dot(a - start, area) / replace_zeros(slope)
 
         def inside(point: Tensor) -> Tensor:
-            return barycentric_coordinates(corners, point).amin(2)
+            return waves.barycentric_coordinates(corners, point).amin(2)
 
         own = planes.face_plane
         ends = (own == segments.plane_before[row, None]) | (own == segments.plane[row, None])

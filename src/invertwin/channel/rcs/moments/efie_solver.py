@@ -12,13 +12,7 @@ import torch
 from jaxtyping import Bool, Complex128, Float64, Int64
 from torch import Tensor
 
-from invertwin.channel.em.plane_waves import (
-    barycentric_coordinates,
-    cross,
-    dot,
-    phasor,
-    polarisations,
-)
+from invertwin.channel.em import plane_waves as waves
 from invertwin.channel.rcs.moments.efie_matrix import EFIEMatrix, build_rwg_basis
 from invertwin.channel.rcs.moments.meshing import ConformingMesh, build_conforming_mesh
 from invertwin.channel.rcs.moments.solver import CurrentSolver, Refusal, power_error, too_many
@@ -131,12 +125,14 @@ class _EFIEEquation:
         return answer.to(torch.complex128).view(right.shape)
 
     def _excitation(self, vertices: Tensor, directions: Tensor) -> Tensor:
-        return self.efie_matrix.excitation(vertices, directions, polarisations(directions, self.up))
+        return self.efie_matrix.excitation(
+            vertices, directions, waves.polarisations(directions, self.up)
+        )
 
     def _incident_fields(self, points: Tensor, directions: Tensor) -> Tensor:
         """Incident fields at points: [row, aspect, 2]."""
-        wave = phasor(self.k * (points @ directions.T))
-        field = polarisations(directions, self.up) + 0j
+        wave = waves.phasor(self.k * (points @ directions.T))
+        field = waves.polarisations(directions, self.up) + 0j
         return torch.einsum("ya,atx->yxat", wave, field).flatten(0, 1)
 
     def far_field(
@@ -173,7 +169,7 @@ class _EFIEEquation:
     def power_error(self, current: Tensor, transmitters: Tensor) -> float:
         """Relative error of the power balance of the first wave's currents (optical theorem)."""
         point, moments = self.efie_matrix.sample_currents(self.fixed_vertices, current[:, 0])
-        sent = polarisations(transmitters, self.up)[0]
+        sent = waves.polarisations(transmitters, self.up)[0]
         return power_error(self.k, point, moments, -transmitters[0], sent)
 
 
@@ -196,7 +192,9 @@ def _sample_interior_points(
     n = normal[origin[closed]]
     opposite, is_hit = _find_opposite_faces(target, start.detach(), -n.detach(), corners.detach())
     start, n, opposite = start[is_hit], n[is_hit], opposite[is_hit]
-    thickness = dot(start - corners[opposite, 0], normal[opposite]) / dot(n, normal[opposite])
+    thickness = waves.dot(start - corners[opposite, 0], normal[opposite]) / waves.dot(
+        n, normal[opposite]
+    )
     depth = torch.tensor(_DEPTH_SHARES, dtype=torch.float64).repeat(len(start))[: len(start)]
     max_depth = thickness.clamp_max(_MAX_DEPTH * wavelength)
     points = start - (depth * max_depth)[:, None] * n
@@ -211,10 +209,10 @@ def _find_opposite_faces(
     """First triangle of a closed body that rays hit, and the mask of rays that hit one."""
     size = 1e-9 * float(np.ptp(target.vertices.detach().numpy(), axis=0).max())
     first = corners[:, 0]
-    normal = cross(corners[:, 1] - first, corners[:, 2] - first)
-    slope, offset = dot(direction[:, None], normal), dot(first - start[:, None], normal)
+    normal = waves.cross(corners[:, 1] - first, corners[:, 2] - first)
+    slope, offset = waves.dot(direction[:, None], normal), waves.dot(first - start[:, None], normal)
     distance = offset / torch.where(slope == 0, 1.0, slope)
     place = start[:, None] + distance[..., None] * direction[:, None]
     hit = target.solid & (slope != 0) & (distance > size)
-    hit &= barycentric_coordinates(corners, place).amin(2) >= 0
+    hit &= waves.barycentric_coordinates(corners, place).amin(2) >= 0
     return torch.where(hit, distance, math.inf).argmin(1), hit.any(1)
