@@ -35,6 +35,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.storage.untrusted import convert_read_errors
 
+_Profiles = Complex[Tensor, "frame range"]
 BeatUnit = Literal["1", "count"]
 
 
@@ -52,10 +53,7 @@ class RangeInterpolator:
     """
 
     def __init__(
-        self,
-        profile: Complex[Tensor, "frame range"],
-        ranges: Float64[Tensor, " range"],
-        center_frequency: float,
+        self, profile: _Profiles, ranges: Float64[Tensor, " range"], center_frequency: float
     ) -> None:
         count = len(ranges)
         step = float(ranges[-1] - ranges[0]) / (count - 1)
@@ -149,7 +147,7 @@ class Capture:
     @classmethod
     def from_range_profile(
         cls,
-        profile: Complex[Tensor, "frame range"],
+        profile: _Profiles,
         ranges: Float64[Tensor, " range"],
         radar: Radar,
         times: Float64[Tensor, " frame"] | None = None,
@@ -235,7 +233,7 @@ class Capture:
         return self._read_data("beat")
 
     @property
-    def range_profile(self) -> Complex[Tensor, "frame range"]:
+    def range_profile(self) -> _Profiles:
         """Complex profiles.
 
         Raises:

@@ -30,6 +30,9 @@ from invertwin.links.transmitters import Transmitters
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Scene
 
+_Points = Float64[Tensor, "row 3"]
+_FaceNumbers = Int64[Tensor, " row"]
+
 
 @dataclass(frozen=True)
 class CellSampling:
@@ -98,9 +101,7 @@ class Cells(ReceiverLocations):
         """
 
     @abstractmethod
-    def find_cells(
-        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
-    ) -> Int64[Tensor, " row"]:
+    def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
         """Cells that hold points of the surface.
 
         Args:
@@ -269,9 +270,7 @@ class MapPlane(Cells):
         points = self._point_at(s, t).view(self.count[0], side, self.count[1], side, 3)
         return points.transpose(1, 2).reshape(-1, side * side, 3)
 
-    def find_cells(
-        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
-    ) -> Int64[Tensor, " row"]:
+    def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
         """Cells that hold points of the plane. See ``Cells.cell_of``."""
         offset, n = points - self.corner, self._normal
         n = n / n.square().sum()
@@ -341,9 +340,7 @@ class MapMesh(Cells):
         a, b, c = (corner[:, None] for corner in self.mesh.vertices[self.mesh.faces].unbind(1))
         return a + far * (b - a + across * (c - b))
 
-    def find_cells(
-        self, points: Float64[Tensor, "row 3"], faces: Int64[Tensor, " row"]
-    ) -> Int64[Tensor, " row"]:
+    def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
         """The triangles. See ``Cells.cell_of``."""
         return faces
 

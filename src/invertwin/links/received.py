@@ -37,6 +37,8 @@ from invertwin.links.spreads import path_powers, safe_sqrt
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.scene import Scene
 
+_Receivers = Float64[Tensor, "rx 3"]
+_Senders = Float64[Tensor, "tx 3"]
 _RECEIVERS_PER_BATCH = 512
 _VALUES_PER_CHUNK = 1 << 21
 _MAX_NODES = 1000  # Gauss's rule of more takes long to find
@@ -148,11 +150,7 @@ class PropagationSettings:
         return gain + more[..., 0], moments + more
 
     def path_moments(
-        self,
-        paths: RayPaths,
-        tx: Float64[Tensor, "tx 3"],
-        rx: Float64[Tensor, "rx 3"],
-        tx_mount: AntennaMount,
+        self, paths: RayPaths, tx: _Senders, rx: _Receivers, tx_mount: AntennaMount
     ) -> Float64[Tensor, "path 3"]:
         """Power of each path, and that times its excess delay [s] and the square of it [s²].
 

@@ -22,6 +22,7 @@ WINDOWS = ("hamming", "hann", "blackman", "rectangular")
 
 SIGMA_PER_FWHM = 1 / math.sqrt(8 * math.log(2))
 _Samples = Complex[Tensor, "*batch sample"]  # beat or symbols
+_Symbols = Complex[Tensor, "*#batch sample"]
 _Values = Float64[Tensor, " point"]  # one at every point
 
 
@@ -237,9 +238,7 @@ class OFDM(SampledWaveform):
         """N · spacing [Hz]: a subcarrier has 1/N of the noise, and 1/N of the transmit power."""
         return self.bandwidth
 
-    def receive_symbols(
-        self, beat: _Samples, symbols: Complex[Tensor, "*#batch sample"]
-    ) -> _Samples:
+    def receive_symbols(self, beat: _Samples, symbols: _Symbols) -> _Samples:
         """Return Y = H X, the receiver's FFT output for these symbols.
 
         Args:
@@ -252,9 +251,7 @@ class OFDM(SampledWaveform):
         return beat.conj() * self._check_symbols(symbols)
 
     @rename_arguments(received="received_symbols")
-    def beat(
-        self, received_symbols: _Samples, symbols: Complex[Tensor, "*#batch sample"]
-    ) -> _Samples:
+    def beat(self, received_symbols: _Samples, symbols: _Symbols) -> _Samples:
         """Return conj(Y / X), the samples of ``range_profile``.
 
         Args:

@@ -22,6 +22,7 @@ from invertwin.errors import InputError
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.scene import Scene
 
+_Points = Float64[Tensor, "v 3"]
 CoherenceFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Interference of two echoes, from 0 to 1, by their differences in range [m], u and v."""
 
@@ -90,11 +91,7 @@ def _require_opaque(others: Scene, target: str, link: Link) -> None:
 
 
 def _visible_shares(
-    others: Scene,
-    points: Float64[Tensor, "v 3"],
-    antennas: Float64[Tensor, "place 3"],
-    *,
-    boundary: bool,
+    others: Scene, points: _Points, antennas: Float64[Tensor, "place 3"], *, boundary: bool
 ) -> Float64[Tensor, " place"]:
     """Fraction of a target's outline visible from each antenna past other objects."""
     found = []
@@ -104,7 +101,7 @@ def _visible_shares(
     return torch.stack(found)
 
 
-def _outline_cells(points: Float64[Tensor, "v 3"], antenna: Float64[Tensor, "3"]) -> PanelCells:
+def _outline_cells(points: _Points, antenna: Float64[Tensor, "3"]) -> PanelCells:
     """Cells of the bounding rectangle of points seen from an antenna, at their nearest depth."""
     centre = points.mean(0)
     normal = torch.nn.functional.normalize(antenna - centre, dim=0)

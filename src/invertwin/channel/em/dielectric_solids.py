@@ -17,6 +17,7 @@ from invertwin.channel.em.plane_waves import SmoothInterfaces, Vectors, cross, d
 from invertwin.checks import is_differentiated
 from invertwin.errors import InputError
 
+_FacetOwners = Int64[Tensor, " facet"]
 MIN_CHORD_AMPLITUDE = 1e-4
 """Amplitude after the mean chord 4V/A of a body, below which no path is traced inside."""
 AIR = -1
@@ -37,7 +38,7 @@ class DielectricSolids:
         names: object names, [object].
     """
 
-    owner: Int64[Tensor, " facet"]
+    owner: _FacetOwners
     transparent: Bool[Tensor, " facet"]
     conducting: Bool[Tensor, " facet"]
     permittivity: Complex128[Tensor, " object"]
@@ -89,7 +90,7 @@ def group_solids(
     wave_numbers: Sequence[float],
     corners: Float64[Tensor, "facet 3 3"],
     closed: Bool[Tensor, " facet"],
-    owner: Int64[Tensor, " facet"],
+    owner: _FacetOwners,
     names: Sequence[str],
 ) -> list[tuple[DielectricSolids | None, list[int]]]:
     """Group frequencies with equal refraction, each with its dielectric solids.
@@ -134,10 +135,7 @@ def group_solids(
 
 
 def require_whole_solids(
-    interfaces: SmoothInterfaces,
-    panels: Collection[int],
-    owner: Int64[Tensor, " facet"],
-    names: Sequence[str],
+    interfaces: SmoothInterfaces, panels: Collection[int], owner: _FacetOwners, names: Sequence[str]
 ) -> None:
     """Raise if dielectric objects close a body only together.
 

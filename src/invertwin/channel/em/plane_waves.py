@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from invertwin.scene.material.fresnel import LEAST_COSINE
 
+_Axes = Float64[Tensor, "row 2 3"]
 Waves: TypeAlias = Complex128[Tensor, "row 2 3"]
 Vectors = Float64[Tensor, "*row 3"]
 
@@ -121,11 +122,8 @@ def reflect_field(
 
 
 def scatter_from_metal(
-    normal: Vectors,
-    direction: Vectors,
-    field: Float64[Tensor, "row 2 3"],
-    received: Float64[Tensor, "row 2 3"],
-) -> tuple[Complex128[Tensor, "row 2 2"], Float64[Tensor, "row 2 3"]]:
+    normal: Vectors, direction: Vectors, field: _Axes, received: _Axes
+) -> tuple[Complex128[Tensor, "row 2 2"], _Axes]:
     """Amplitudes S per m² and unit wave number of smooth metal, and its reflected field.
 
     With F of ``radiate_field`` for a conductor, p·F = −(jk/2π)[(p·d)(n·E) − (p·E)(n·d)].

@@ -20,6 +20,8 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import phasor
 
+_Values = Complex128[Tensor, "*row"]
+_Parameters = Float64[Tensor, "*#row"]
 _WEIDEMAN_TERMS = 40  # of Weideman's sum: error 1e-14
 _QUADRATURE_POINTS = 24  # of either quadrature: error 1e-14
 _CHAIN_POINTS = 48  # of the quadrature over a third edge
@@ -52,7 +54,7 @@ _GRADED_RULE = tuple(values.tolist() for values in _graded_quadrature(_CHAIN_POI
 _LAGUERRE_RULE = tuple(zip(*np.polynomial.laguerre.laggauss(_QUADRATURE_POINTS), strict=True))
 
 
-def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
+def transition(s: Float64[Tensor, "*row"]) -> _Values:
     """Transition function g(s) = 2j exp(js²) ∫ exp(−jt²) dt from s to ∞ for s ≥ 0, odd in s.
 
     At zero it jumps by 2√π exp(jπ/4), as the direct wave does; asymptotically it is 1/s. Its
@@ -64,9 +66,7 @@ def transition(s: Float64[Tensor, "*row"]) -> Complex128[Tensor, "*row"]:
     return _TransitionFunction.apply(s)  # type: ignore[return-value]
 
 
-def end_transition(
-    s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"]
-) -> Complex128[Tensor, "*row"]:
+def end_transition(s: _Parameters, t: _Parameters) -> _Values:
     """Part of g(s) due to the edge beyond t: exp(jπ/4)/√π ∫ s exp(−jτ²)/(s² + τ²) dτ.
 
     The field of an edge whose ends are t₁ and t₂ away from the diffraction point, positive
@@ -82,9 +82,7 @@ def end_transition(
     return torch.where(t < 0, transition(s) - beyond, beyond)  # type: ignore[operator]
 
 
-def edge_transition(
-    s: Float64[Tensor, "*#row"], ends: Float64[Tensor, "*#row 2"] | None
-) -> Complex128[Tensor, "*row"]:
+def edge_transition(s: _Parameters, ends: Float64[Tensor, "*#row 2"] | None) -> _Values:
     """Transition function of a finite edge.
 
     Args:
@@ -98,10 +96,8 @@ def edge_transition(
 
 
 def edge_transition_slope(
-    s: Float64[Tensor, "*#row"],
-    ends: Float64[Tensor, "*#row 2"] | None,
-    value: Complex128[Tensor, "*row"],
-) -> Complex128[Tensor, "*row"]:
+    s: _Parameters, ends: Float64[Tensor, "*#row 2"] | None, value: _Values
+) -> _Values:
     """Derivative of ``edge_transition`` with respect to s.
 
     Args:
@@ -117,9 +113,7 @@ def edge_transition_slope(
     return slope
 
 
-def corner_transition(
-    s: Float64[Tensor, "*#row"], t: Float64[Tensor, "*#row"], coupling: Float64[Tensor, "*#row"]
-) -> Complex128[Tensor, "*row"]:
+def corner_transition(s: _Parameters, t: _Parameters, coupling: _Parameters) -> _Values:
     """Double-diffraction transition function −4 ∫∫ exp(−j(2sx + 2ty + x² + y² − 2wxy)) dx dy.
 
     Both integrals go from 0 to ∞, for s and t ≥ 0; otherwise, the function is −1 times that of −s,

@@ -37,6 +37,7 @@ from invertwin.channel.em.transition_functions import (
 from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
+_Reals = Float64[Tensor, " row"]
 _SHEET_TOLERANCE = 1e-6  # of an opening: both faces belong to one sheet
 _MIN_COUPLING = 1e-9  # couplings below this are neglected
 _SERIES_ANGLE = 1e-4  # rad from a boundary, within which quotients are series
@@ -47,14 +48,14 @@ DyadDerivative = Literal["value", "in", "out"]
 """Coefficient, or derivative with respect to the azimuth of incidence or diffraction [1/rad]."""
 
 
-FaceCoefficients = Callable[[int, Float64[Tensor, " row"]], FieldCoefficients]
+FaceCoefficients = Callable[[int, _Reals], FieldCoefficients]
 """Field coefficients of the faces 0 and 1 (n) of wedges, at cosines of the angle of incidence.
 
 Those of a sheet refer to its mid-plane, its transmission to the straight path through air.
 """
 
 
-def conductor_coefficients(face: int, cosine: Float64[Tensor, " row"]) -> FieldCoefficients:
+def conductor_coefficients(face: int, cosine: _Reals) -> FieldCoefficients:
     """Field coefficients of perfectly conducting faces.
 
     Args:
@@ -84,9 +85,9 @@ class EdgeDiffraction:
     wedges: Wedges
     incident_direction: Float64[Tensor, "row 3"]
     diffracted_direction: Float64[Tensor, "row 3"]
-    azimuth_in: Float64[Tensor, " row"]
-    azimuth: Float64[Tensor, " row"]
-    distance_parameter: Float64[Tensor, " row"]
+    azimuth_in: _Reals
+    azimuth: _Reals
+    distance_parameter: _Reals
     face_coefficients: FaceCoefficients = conductor_coefficients
     end_parameters: Float64[Tensor, "row 2"] | None = None
     absorbing: bool = False
@@ -102,7 +103,7 @@ class EdgeDiffraction:
         )
 
     @property
-    def sin_beta(self) -> Float64[Tensor, " row"]:
+    def sin_beta(self) -> _Reals:
         """sinβ, with β the angle between the incident wave and the edge."""
         return cross(edge_axis(self.wedges), self.incident_direction).norm(dim=1)
 
@@ -129,10 +130,7 @@ def diffraction_dyads(
 
 
 def double_dyad(
-    first: EdgeDiffraction,
-    second: EdgeDiffraction,
-    coupling: Float64[Tensor, " row"],
-    wave_number: float,
+    first: EdgeDiffraction, second: EdgeDiffraction, coupling: _Reals, wave_number: float
 ) -> Complex128[Tensor, "row 3 3"]:
     """Double-diffraction dyads of two consecutive edges [m].
 

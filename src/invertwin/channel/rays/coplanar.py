@@ -15,6 +15,7 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError, PhysicsWarning
 
+_ObjectPairs = Bool[Tensor, "object object"]
 _MAX_PAIRS = 20_000  # most coplanar pairs of triangles that are compared, evenly chosen
 _MAX_POINTS = 64  # most tested points of a pair of objects
 _MAX_POSES = 16  # most tested radar poses
@@ -79,9 +80,7 @@ def refuse_coplanar_surfaces(
         )
 
 
-def _find_coplanar_pairs(
-    rays: ray_scene.RayScene, pairs: Bool[Tensor, "object object"]
-) -> set[tuple[int, int]]:
+def _find_coplanar_pairs(rays: ray_scene.RayScene, pairs: _ObjectPairs) -> set[tuple[int, int]]:
     """Find pairs of objects with visible coplanar surfaces; cached for unmoved objects."""
     topology, points = rays.topology, rays.geometry.vertices.detach()
     antennas = torch.cat([rays.link.tx.detach(), rays.link.rx.detach()])
@@ -98,9 +97,7 @@ def _find_coplanar_pairs(
     return known
 
 
-def _find_visible_pairs(
-    rays: ray_scene.RayScene, pairs: Bool[Tensor, "object object"]
-) -> set[tuple[int, int]]:
+def _find_visible_pairs(rays: ray_scene.RayScene, pairs: _ObjectPairs) -> set[tuple[int, int]]:
     """Find those of some pairs of objects that are coplanar at a point that an antenna sees."""
     geometry, link, count = rays.geometry, rays.link, rays.poses_per_scene
     looks = torch.arange(0, count, max(1, -(-count // _MAX_POSES)))
@@ -114,7 +111,7 @@ def _find_visible_pairs(
 def _find_seen_pairs(
     rays: ray_scene.Occluders,
     vertices: Float64[Tensor, "v 3"],
-    pairs: Bool[Tensor, "object object"],
+    pairs: _ObjectPairs,
     viewers: Float64[Tensor, "*scene n 3"],
     sheets: Bool[Tensor, " face"],
     object_scene: Int64[Tensor, " object"] | None = None,
@@ -144,7 +141,7 @@ def _find_seen_pairs(
     return found
 
 
-def _relevant_pairs(geometry: Geometry) -> Bool[Tensor, "object object"]:
+def _relevant_pairs(geometry: Geometry) -> _ObjectPairs:
     """Find pairs of objects of which one moves, or whose materials differ."""
     count, owner = len(geometry.names), geometry.face_object
     lowest, highest = (

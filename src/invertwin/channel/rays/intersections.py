@@ -17,6 +17,7 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
 
+_Numbers = Int64[Tensor, " n"]
 PLANE_TOLERANCE = 1e-9  # closer than this to a plane [m] is in it
 _MIN_PLANE_SINE = 1e-7  # least sine of the angle between two planes that cross
 _EDGE_EXTENSION = 4e-7  # how far an edge's ray goes beyond its ends, relative to their coordinates
@@ -38,12 +39,12 @@ class IntersectionCurves(Rows):
             elsewhere.
     """
 
-    first: Int64[Tensor, " n"]
-    second: Int64[Tensor, " n"]
+    first: _Numbers
+    second: _Numbers
     start: Float64[Tensor, "n 3"]
     end: Float64[Tensor, "n 3"]
     touching: Bool[Tensor, " n"]
-    edge: Int64[Tensor, " n"]
+    edge: _Numbers
 
 
 def find_possible_intersections(
@@ -142,7 +143,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
 
 
 def _trace_edges(
-    rays: RayScene, edges: Int64[Tensor, " n"], extended: Bool[Tensor, " n"]
+    rays: RayScene, edges: _Numbers, extended: Bool[Tensor, " n"]
 ) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
     """Find intersections of edges with triangles; some edges are extended beyond their ends."""
     # In both directions, so that neither of two close surfaces hides the other.
@@ -173,10 +174,7 @@ def _trace_edges(
 
 
 def intersect_triangles(
-    points: Float64[Tensor, "v 3"],
-    topology: Topology,
-    first: Int64[Tensor, " n"],
-    second: Int64[Tensor, " n"],
+    points: Float64[Tensor, "v 3"], topology: Topology, first: _Numbers, second: _Numbers
 ) -> IntersectionCurves:
     """Intersect pairs of triangles, and keep the intersections that are segments.
 

@@ -25,6 +25,9 @@ from invertwin.checks import is_differentiated, strip_derivatives
 from invertwin.deprecation import rename_arguments
 from invertwin.scene.scene import Scene
 
+_Fractions = Float64[Tensor, " n"]
+_Numbers = Int64[Tensor, " n"]
+
 
 @dataclass(frozen=True)
 class DiscontinuityCurves:
@@ -73,7 +76,7 @@ class ViewpointScene:
         """True if derivatives flow to the vertices or to the viewpoint."""
         return is_differentiated(self._vertices) or is_differentiated(self._viewpoint)
 
-    def find_first_faces(self, directions: Float64[Tensor, "n 3"]) -> Int64[Tensor, " n"]:
+    def find_first_faces(self, directions: Float64[Tensor, "n 3"]) -> _Numbers:
         """The triangle that each ray from the place meets first (−1: none).
 
         Args:
@@ -85,9 +88,7 @@ class ViewpointScene:
         with tracing():
             return self._occluders.find_first_hits(torch.zeros_like(way), way)[0]
 
-    def plane_distances(
-        self, face: Int64[Tensor, " n"], directions: Float64[Tensor, "n 3"]
-    ) -> Float64[Tensor, " n"]:
+    def plane_distances(self, face: _Numbers, directions: Float64[Tensor, "n 3"]) -> _Fractions:
         """Compute distances to the planes of triangles, in lengths of the directions; attached.
 
         Args:
@@ -138,10 +139,7 @@ class ViewpointScene:
         return DiscontinuityCurves(*ends, found.first, found.second, is_intersection=True)
 
     def points_on_curves(
-        self,
-        curves: DiscontinuityCurves,
-        piece: Int64[Tensor, " n"],
-        fraction: Float64[Tensor, " n"],
+        self, curves: DiscontinuityCurves, piece: _Numbers, fraction: _Fractions
     ) -> Float64[Tensor, "n 3"]:
         """Points of curves, attached: they move with the edge, or with the planes that cross.
 

@@ -28,6 +28,8 @@ from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows
 
+_StepNumbers = Int64[Tensor, "row step"]
+_StepVectors = Float64[Tensor, "row step 3"]
 Vectors: TypeAlias = Float64[Tensor, "row 3"]
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
 DIRECT = torch.zeros(1, 0, dtype=torch.int64)
@@ -76,7 +78,7 @@ class CandidateSurfaces(Occluders):
         height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
         return arrays.to_float(self.margin / height.clamp_min(1e-300))
 
-    def images(self, positions: Vectors, steps: Int64[Tensor, "row step"]) -> list[Vectors]:
+    def images(self, positions: Vectors, steps: _StepNumbers) -> list[Vectors]:
         """Images of positions after each step of sequences, relative to the local origin [m].
 
         Args:
@@ -109,8 +111,8 @@ class SpecularPaths(Rows):
 
 def image_positions(
     position: Vectors,
-    point: Float64[Tensor, "row step 3"],
-    normal: Float64[Tensor, "row step 3"],
+    point: _StepVectors,
+    normal: _StepVectors,
     transmitted: Bool[Tensor, "row step"],
 ) -> list[Vectors]:
     """Positions of a source and of its images after each step.
@@ -138,10 +140,7 @@ def replace_zeros(values: Tensor) -> Tensor:
 
 
 def interaction_points(
-    target: Vectors,
-    images: list[Vectors],
-    point: Float64[Tensor, "row step 3"],
-    normal: Float64[Tensor, "row step 3"],
+    target: Vectors, images: list[Vectors], point: _StepVectors, normal: _StepVectors
 ) -> list[Vectors]:
     """Intersection points of paths with the planes, from the source on.
 
@@ -175,7 +174,7 @@ class UnfoldedPaths:
         self,
         vertices: Float64[Tensor, "v 3"],
         topology: Topology,
-        faces: Int64[Tensor, "row step"],
+        faces: _StepNumbers,
         transmitted: Bool[Tensor, "row step"],
         source: Vectors,
     ) -> None:
@@ -388,10 +387,7 @@ class _SpecularSegments(Rows):
 
 
 def intersects_planes(
-    surfaces: CandidateSurfaces,
-    steps: Int64[Tensor, "row step"],
-    images: list[Vectors],
-    target: Vectors,
+    surfaces: CandidateSurfaces, steps: _StepNumbers, images: list[Vectors], target: Vectors
 ) -> Bool[Tensor, " row"]:
     """Test if lines to the images intersect the planes within their rectangles, in order.
 
@@ -419,11 +415,11 @@ def intersects_planes(
 
 def find_unobstructed_paths(
     surfaces: CandidateSurfaces,
-    steps: Int64[Tensor, "row step"],
+    steps: _StepNumbers,
     source: Vectors,
     targets: Vectors,
     target_planes: Int64[Tensor, " row"] | None = None,
-) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row step"]]:
+) -> tuple[Bool[Tensor, " row"], _StepNumbers]:
     """Find unobstructed paths along given planes, and the triangles of their interactions.
 
     Args:

@@ -22,6 +22,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.storage.folders import replace_file
 
+_Maps = Float[Tensor, "frame range u v"]
 _QUADRATURE = 4096  # quadrature nodes over the distribution of an order statistic
 _Values = Float64[Tensor, " point"]  # one at every point
 
@@ -169,10 +170,7 @@ def point_cloud(
 
 
 def peaks(
-    power: Float[Tensor, "frame range u v"],
-    detections: Bool[Tensor, "frame range u"],
-    radar: Radar,
-    grid: Grid,
+    power: _Maps, detections: Bool[Tensor, "frame range u"], radar: Radar, grid: Grid
 ) -> PointCloud:
     """Return a point for each detected cell that is a local maximum over range and direction.
 

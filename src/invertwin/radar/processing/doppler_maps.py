@@ -19,6 +19,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.runtime.progress import track
 
+_RangeDoppler = Float[Tensor, "velocity range"]
 # Range-rate bins on either side of zero with slow drift of static echoes, and the maximum level
 # of drift relative to the static echo at its range.
 _STATIC_BINS = 2
@@ -80,7 +81,7 @@ class DopplerMaps:
 
     grid: Grid
     velocities: Float64[Tensor, " velocity"]
-    range_doppler: Float[Tensor, "velocity range"]
+    range_doppler: _RangeDoppler
     total_power: Float64[Tensor, "range u v"]
     moving_power: Float64[Tensor, "range u v"] | None
     strongest_peak: Peak
@@ -124,12 +125,7 @@ def doppler_maps(
 
 
 def _sum_range_rates(
-    cube: _Cube,
-    level: Float[Tensor, "velocity range"],
-    radar: Radar,
-    grid: Grid,
-    chirps: Chirps,
-    candidates: _Cells,
+    cube: _Cube, level: _RangeDoppler, radar: Radar, grid: Grid, chirps: Chirps, candidates: _Cells
 ) -> tuple[Float64[Tensor, "range u v"], Peak]:
     """Sum power over all range rates, and return the strongest of the candidate cells.
 
@@ -156,9 +152,7 @@ def _sum_range_rates(
     return total, max(peaks, key=attrgetter("power"))
 
 
-def _detect_moving_cells(
-    moving: Float[Tensor, "velocity range"], flat: Float[Tensor, "velocity range"], looks: int
-) -> _Cells:
+def _detect_moving_cells(moving: _RangeDoppler, flat: _RangeDoppler, looks: int) -> _Cells:
     """Detect cells above noise and drift."""
     moving, middle = moving.double(), len(flat) // 2
     rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]

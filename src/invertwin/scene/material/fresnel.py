@@ -11,6 +11,8 @@ from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
 from invertwin.scene.material.values import Value, checked_value, evaluate_value
 
+_Cosines = Float[Tensor, "*#angle"]
+_Constants = Shaped[Tensor, "*#angle"]
 LEAST_COSINE = 1e-9
 """Shift that avoids 0/0 at grazing incidence on ε = 1, below rounding elsewhere."""
 _SAFE_POWER = 1e-30  # smaller reflectances are zero, without derivative of their root
@@ -60,9 +62,7 @@ def complex_permittivity(
 
 
 def fresnel_coefficients(
-    permittivity: Shaped[Tensor, "*#angle"],
-    cos_theta: Float[Tensor, "*#angle"],
-    permeability: Shaped[Tensor, "*#angle"] | None = None,
+    permittivity: _Constants, cos_theta: _Cosines, permeability: _Constants | None = None
 ) -> FieldCoefficients:
     """Compute the complex field coefficients of a half space for waves from air.
 
@@ -87,9 +87,7 @@ def fresnel_coefficients(
 
 
 def fresnel_amplitude(
-    permittivity: Shaped[Tensor, "*#angle"],
-    cos_theta: Float[Tensor, "*#angle"],
-    permeability: Shaped[Tensor, "*#angle"] | None = None,
+    permittivity: _Constants, cos_theta: _Cosines, permeability: _Constants | None = None
 ) -> Float[Tensor, "*angle"]:
     """Compute the square root of the unpolarised Fresnel power reflectance of a half space.
 
@@ -123,9 +121,7 @@ def safe_root(power: Float[Tensor, "*row"]) -> Float[Tensor, "*row"]:
     return torch.where(seen, torch.where(seen, power, 1.0).sqrt(), 0.0)
 
 
-def fresnel_reflectance(
-    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
-) -> Float[Tensor, "*angle"]:
+def fresnel_reflectance(permittivity: _Constants, cos_theta: _Cosines) -> Float[Tensor, "*angle"]:
     """Compute the unpolarised Fresnel power reflectance (|r_s|² + |r_p|²)/2 of a half space.
 
     Args:
@@ -135,9 +131,7 @@ def fresnel_reflectance(
     return fresnel_amplitude(permittivity, cos_theta) ** 2
 
 
-def fresnel_transmittance(
-    permittivity: Shaped[Tensor, "*#angle"], cos_theta: Float[Tensor, "*#angle"]
-) -> Float[Tensor, "*angle"]:
+def fresnel_transmittance(permittivity: _Constants, cos_theta: _Cosines) -> Float[Tensor, "*angle"]:
     """Compute the unpolarised power transmittance of a half space, one minus its reflectance. It is
     equal in the reverse direction at the refracted angle.
 

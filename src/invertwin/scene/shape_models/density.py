@@ -18,6 +18,7 @@ from invertwin.scene.shape_models.distance import signed_distance
 from invertwin.scene.shape_models.iso_surface import march_cubes
 from invertwin.scene.shape_models.lattice import Lattice
 
+_Samples = Float64[Tensor, "x y z"]
 # Minimum initial density over the inverse node spacing: softplus is too flat below.
 _MIN_DENSITY = 1e-3
 
@@ -44,12 +45,7 @@ class DensityGrid(ObjectModule):
     """
 
     def __init__(
-        self,
-        object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        density: Float64[Tensor, "x y z"],
-        albedo: float = 1.0,
+        self, object: str, low: ArrayLike, high: ArrayLike, density: _Samples, albedo: float = 1.0
     ) -> None:
         super().__init__(object)
         self.albedo = checked_number(albedo, "albedo", 0.0, open_low=True)
@@ -113,7 +109,7 @@ class DensityGrid(ObjectModule):
         return float(self.lattice.spacing.mean())
 
     @property
-    def density(self) -> Float64[Tensor, "x y z"]:
+    def density(self) -> _Samples:
         """Extinction at the nodes [1/m]."""
         return softplus(self.value) / self._density_unit
 

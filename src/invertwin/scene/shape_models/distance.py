@@ -20,6 +20,8 @@ from invertwin.scene.parameters import ObjectModule
 from invertwin.scene.shape_models.iso_surface import iso_surface
 from invertwin.scene.shape_models.lattice import Lattice, interpolate_cubic
 
+_Samples = Float64[Tensor, "x y z"]
+
 
 def signed_distance(mesh: Mesh, points: Float64[Tensor, "p 3"]) -> Float64[Tensor, " p"]:
     """Compute the signed distance of points to a surface [m], negative inside (winding number).
@@ -84,12 +86,7 @@ class DistanceGrid(_Distance):
     """
 
     def __init__(
-        self,
-        object: str,
-        low: ArrayLike,
-        high: ArrayLike,
-        value: Float64[Tensor, "x y z"],
-        smoothing: float = 0.0,
+        self, object: str, low: ArrayLike, high: ArrayLike, value: _Samples, smoothing: float = 0.0
     ) -> None:
         do = "give one for each node"
         given = checked_tensor(value, (None, None, None), "signed distances [m]", do)
@@ -146,7 +143,7 @@ class DistanceGrid(_Distance):
         return cls.from_function(object, low, high, counts, partial(signed_distance, mesh), smooth)
 
     @property
-    def distances(self) -> Float64[Tensor, "x y z"]:
+    def distances(self) -> _Samples:
         """Return signed distances at the nodes [m]."""
         return self._smoother.power(-1, self.value)
 

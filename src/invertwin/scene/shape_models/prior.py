@@ -22,6 +22,7 @@ from invertwin.scene.shape_models.lattice import (
 )
 from invertwin.storage.untrusted import read_arrays, safe_reader
 
+_Latent = Float64[Tensor, " k"]
 _MODEL = "vehicle_prior.npz"
 _FORMAT = "invertwin shape prior 1"
 _SPACING = 0.1  # default node spacing of meshed shapes [m]
@@ -104,7 +105,7 @@ class ShapePrior:
             counts = (((self.high - self.low) / _SPACING - 1e-9).ceil().int() + 1).tolist()
         return Lattice.from_bounds(self.low, self.high, counts, sliced=sliced)
 
-    def values(self, latent: Float64[Tensor, " k"]) -> Float64[Tensor, "x y z"]:
+    def values(self, latent: _Latent) -> Float64[Tensor, "x y z"]:
         """Return signed distances at the decoder's nodes [m], negative inside.
 
         Raises:
@@ -114,9 +115,7 @@ class ShapePrior:
         half = self.decoder(self._check_latent(latent)).reshape(x, (y + 1) // 2, z)
         return torch.cat([half[:, 1:].flip(1), half], dim=1)
 
-    def distance(
-        self, points: Float64[Tensor, "p 3"], latent: Float64[Tensor, " k"]
-    ) -> Float64[Tensor, " p"]:
+    def distance(self, points: Float64[Tensor, "p 3"], latent: _Latent) -> Float64[Tensor, " p"]:
         """Return the field at points in the shape's frame [m], negative inside.
 
         Args:
@@ -125,9 +124,7 @@ class ShapePrior:
         """
         return interpolate_cubic(self.values(latent), self.lattice, points)
 
-    def slices(
-        self, latent: Float64[Tensor, " k"], counts: Sequence[int]
-    ) -> Iterator[Float64[Tensor, "y z"]]:
+    def slices(self, latent: _Latent, counts: Sequence[int]) -> Iterator[Float64[Tensor, "y z"]]:
         """Yield the field at the nodes of a lattice in the box, plane by plane along x [m].
 
         Only one plane is in memory.
@@ -142,9 +139,7 @@ class ShapePrior:
         values, target = self.values(latent), self.nodes(counts, sliced=True)
         return interpolate_cubic_slices(values, self.lattice, target)
 
-    def decode(
-        self, latent: Float64[Tensor, " k"], counts: Sequence[int]
-    ) -> Float64[Tensor, "x y z"]:
+    def decode(self, latent: _Latent, counts: Sequence[int]) -> Float64[Tensor, "x y z"]:
         """Return the whole field at the nodes of a lattice in the box [m].
 
         Args:
@@ -153,7 +148,7 @@ class ShapePrior:
         """
         return torch.stack(list(self.slices(latent, counts)))
 
-    def mesh(self, latent: Float64[Tensor, " k"], counts: Sequence[int] | None = None) -> Mesh:
+    def mesh(self, latent: _Latent, counts: Sequence[int] | None = None) -> Mesh:
         """Return the surface of a latent, whose vertices follow it (see :func:`iso_surface`).
 
         Args:

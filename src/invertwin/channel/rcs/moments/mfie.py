@@ -27,6 +27,9 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import cross, dot, phasor, polarisations
 from invertwin.channel.rcs.moments.solver import CurrentSolver, Refusal, power_error, too_many
 
+_Vector = Float64[Tensor, "3"]
+_Aspects = Float64[Tensor, "aspect 3"]
+_Facets = Float64[Tensor, "facet 3 3"]
 _PIECES_PER_SIDE = 4.0  # side of a cell over the longest side of its pieces
 _SEEDING_PIECES = 40  # pieces per cell in the first rounds of clustering
 _NORMAL_WEIGHT = 0.7  # distance of orthogonal normals, in sides of a cell
@@ -199,12 +202,7 @@ class MFIESolver(CurrentSolver[SurfaceCells]):
     MIN_SQUARES = 250
     ELEMENTS = "cells"
 
-    def __init__(
-        self,
-        corners: Float64[Tensor, "facet 3 3"],
-        up: Float64[Tensor, "3"],
-        refinements: Sequence[int] = (0,),
-    ) -> None:
+    def __init__(self, corners: _Facets, up: _Vector, refinements: Sequence[int] = (0,)) -> None:
         self.corners, self.up = corners.numpy(), up
         sides = self.corners[:, 1:] - self.corners[:, :1]
         normals = np.cross(sides[:, 0], sides[:, 1])
@@ -239,7 +237,7 @@ class _MFIEEquation:
     """MFIE of cells at one frequency, with unknowns [t₁ of all cells, t₂ of all cells]."""
 
     def __init__(
-        self, cells: SurfaceCells, wave_number: float, up: Float64[Tensor, "3"], wave_count: int
+        self, cells: SurfaceCells, wave_number: float, up: _Vector, wave_count: int
     ) -> None:
         self.k, self.up = wave_number, up
         self.use_direct_solver = wave_count * _CELLS_PER_WAVE_DIRECT > len(cells.point)
@@ -292,9 +290,7 @@ class _MFIEEquation:
         lower, pivots = torch.linalg.lu_factor(self.matrix)
         return lower, pivots
 
-    def solve_currents(
-        self, transmitters: Float64[Tensor, "aspect 3"]
-    ) -> Complex128[Tensor, "cell aspect 2 3"]:
+    def solve_currents(self, transmitters: _Aspects) -> Complex128[Tensor, "cell aspect 2 3"]:
         """Solve the currents η J of plane waves of 1 V/m.
 
         Args:
@@ -327,8 +323,8 @@ class _MFIEEquation:
     def far_field(
         self,
         current: Complex128[Tensor, "cell aspect 2 3"],
-        transmitters: Float64[Tensor, "aspect 3"],
-        receivers: Float64[Tensor, "aspect 3"],
+        transmitters: _Aspects,
+        receivers: _Aspects,
     ) -> Complex128[Tensor, "aspect 2 2"]:
         """Compute the far-field amplitudes S of currents, at the receiver of each wave.
 
