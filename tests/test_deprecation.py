@@ -49,8 +49,11 @@ def ball() -> iw.Scene:
 def renamed() -> Iterator[tuple[Any, str, str]]:
     """Every old name of every menu."""
     for module, names in read_renamed_attributes().items():
-        if module.rpartition(".")[2][0].isupper():
-            continue  # members of a class
+        parts = module.split(".")
+        if len(parts) > 2 and not inspect.ismodule(
+            getattr(importlib.import_module(".".join(parts[:2])), parts[2], None)
+        ):
+            continue  # members of a class, or arguments
         room = importlib.import_module(module)
         for old, new in names.items():
             yield room, old, new

@@ -24,10 +24,10 @@ def warn_renamed(old: str, new: str, stacklevel: int = 3) -> None:
 
 
 def rename_attributes(module: str) -> None:
-    """Let a module, and its classes, find attributes by the old names of ``renamed.toml``.
+    """Let a module, its classes and its functions know the old names of ``renamed.toml``.
 
     It sets the module's ``__getattr__``, so that type checkers know the new names alone. Call it
-    where the classes are defined.
+    where the classes and functions are defined, or where users get them from.
 
     Args:
         module: dotted name of the module, ``__name__``.
@@ -50,13 +50,20 @@ def rename_attributes(module: str) -> None:
     found["__getattr__"] = find_attribute
     for title, members in read_renamed_attributes().items():
         owner, _, name = title.rpartition(".")
-        if owner == module and isinstance(found.get(name), type):
-            rename_members(found[name], **members)
+        room, _, holder = owner.rpartition(".")
+        place = sys.modules[module] if owner == module else found.get(holder, object)
+        value = vars(place).get(name) if module in (owner, room) else None
+        if isinstance(value, type):
+            rename_members(value, **members)
+        elif isinstance(value, classmethod):
+            setattr(place, name, classmethod(rename_arguments(**members)(value.__func__)))
+        elif inspect.isfunction(value):
+            setattr(place, name, rename_arguments(**members)(value))
 
 
 @cache
 def read_renamed_attributes() -> dict[str, dict[str, str]]:
-    """Read old names and the new ones, by dotted name of the module or class."""
+    """Read old names and the new ones, by dotted name of the module, class or function."""
     text = files(__name__.partition(".")[0]).joinpath("renamed.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 

@@ -9,7 +9,6 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin import checks
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
@@ -103,7 +102,6 @@ class Camera:
         )
         return Camera(places, rotations, width, height, width / (2 * math.tan(angle / 2)))
 
-    @rename_arguments(chosen="indices")
     def frames(self, indices: Sequence[int]) -> "Camera":
         """Return the camera with selected frames.
 

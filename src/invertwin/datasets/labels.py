@@ -11,7 +11,6 @@ from torch import Tensor
 
 from invertwin.channel import visible_points
 from invertwin.constants import OLD_AXES
-from invertwin.deprecation import rename_arguments
 from invertwin.radar.radar import Radar
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.mesh import concatenate_meshes
@@ -22,7 +21,6 @@ _POINTS = 256  # at least so many on every object
 _R2_STEPS = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
 
 
-@rename_arguments(seen="visibility")
 def object_labels(
     scene: Scene,
     visibility: Mapping[str, Float[Tensor, "frame face"]],

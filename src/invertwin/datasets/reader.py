@@ -14,7 +14,6 @@ from torch.utils.data import Dataset
 from invertwin.checks import check_choice
 from invertwin.datasets.labels import convert_old_labels
 from invertwin.datasets.shards import OLD_FORMAT, DatasetManifest, locate_members, read_manifests
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import convert_read_errors, existing_file
 
@@ -42,7 +41,6 @@ class SampleDataset(Dataset[Any]):
         InputError: No complete data set, or an entry that it does not have.
     """
 
-    @rename_arguments(keep="entries")
     def __init__(
         self,
         folder: str | Path,

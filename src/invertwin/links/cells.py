@@ -21,7 +21,7 @@ from torch import Tensor
 
 from invertwin import checks
 from invertwin.channel import PathMeasure, RayPaths, trace_coverage
-from invertwin.deprecation import rename_arguments, rename_members
+from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.limits import Count
 from invertwin.links.places import ReceiverLocations
@@ -204,7 +204,6 @@ class MapPlane(Cells):
             )
 
     @classmethod
-    @rename_arguments(cell="cell_size")
     def horizontal(
         cls,
         low: checks.ArrayLike,

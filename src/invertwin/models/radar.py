@@ -13,7 +13,6 @@ from torch import Tensor
 from invertwin import channel
 from invertwin.capture.capture import Capture
 from invertwin.checks import checked_count, set_fields
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
@@ -255,7 +254,6 @@ class BeatMap(ExactMap):
         return recording.beat[(slice(None), *self.channels)]
 
 
-@rename_arguments(looks="realisations")
 def surrogate_correlation(
     scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, realisations: int = 16
 ) -> float:

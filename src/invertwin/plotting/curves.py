@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.deprecation import rename_arguments
 from invertwin.plotting.figures import color, legible, numbers, row_of_axes
 
 Curve = tuple[NDArray, NDArray]
@@ -72,7 +71,6 @@ def _draw_errors(axes, losses, errors, label: str) -> None:
     axes.set(xlabel="step", ylabel=label, ylim=(0, 1.05 * highest))
 
 
-@rename_arguments(along="displacements")
 def landscape(exact: Curve, surrogates: Mapping[str, Curve], displacements: str) -> Figure:
     """The exact signal's loss beside the surrogate's, over the offset from the truth.
 

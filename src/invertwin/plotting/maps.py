@@ -17,7 +17,6 @@ from torch import Tensor
 
 from invertwin.channel import Grid
 from invertwin.checks import check_shape, check_some
-from invertwin.deprecation import rename_arguments
 from invertwin.inversion.confidence.realisations import coarsen_map
 from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
 from invertwin.radar import DopplerMaps
@@ -79,7 +78,6 @@ def spectrum(
     return figure
 
 
-@rename_arguments(shown="maps")
 def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figure:
     """Power maps of different axes side by side, each in dB below its own peak.
 
@@ -294,7 +292,6 @@ def bin_edges(positions: Tensor | Sequence[float]) -> tuple[float, float]:
 _SHARE = 0.995  # of the pixels have derivatives within the colours
 
 
-@rename_arguments(shown="panels")
 def images(
     panels: Mapping[str, Float[Tensor, "row column"]],
     derivatives: Mapping[str, Float[Tensor, "row column"]] | None = None,

@@ -8,7 +8,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from invertwin.deprecation import rename_arguments
 from invertwin.links import MapPlane
 from invertwin.plotting.coverage import coverage, project_edges
 from invertwin.plotting.figures import PALETTE, legible, numbers, row_of_axes
@@ -49,7 +48,6 @@ def floor_plan(
     return figure
 
 
-@rename_arguments(along="positions", ends="search_ends")
 def placements(
     positions: Float64[Tensor, " place"],
     levels: Float64[Tensor, " place"],
@@ -74,7 +72,6 @@ def placements(
     return figure
 
 
-@rename_arguments(places="positions")
 def transmitter_fits(
     scene: Scene,
     height: float,

@@ -14,7 +14,6 @@ from torch import Tensor
 from invertwin import limits
 from invertwin.checks import check_choice, check_fields
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
 
@@ -250,7 +249,6 @@ class OFDM(SampledWaveform):
         """
         return beat.conj() * self._check_symbols(symbols)
 
-    @rename_arguments(received="received_symbols")
     def beat(self, received_symbols: _Samples, symbols: _Symbols) -> _Samples:
         """Return conj(Y / X), the samples of ``range_profile``.
 

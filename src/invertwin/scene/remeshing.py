@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from invertwin.checks import checked_number
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.mesh import Mesh
@@ -26,7 +25,6 @@ _SPLIT_FACTOR, _COLLAPSE_FACTOR = 4 / 3, 4 / 5
 _MIN_FLIP_COSINE = 0.5  # minimum cosine between two triangles of a flipped edge: creases stay
 
 
-@rename_arguments(edge="edge_length")
 def remesh(mesh: Mesh, edge_length: float) -> Mesh:
     """Remesh a surface with edges of nearly one length; topology and borders are preserved.
 
@@ -54,7 +52,6 @@ def remesh(mesh: Mesh, edge_length: float) -> Mesh:
     return surface.to_mesh()
 
 
-@rename_arguments(edge="edge_length")
 def require_edge_length(mesh: Mesh, edge_length: float) -> float:
     """Validate an edge length for remeshing a surface.
 

@@ -13,7 +13,6 @@ from pydantic import ConfigDict, TypeAdapter
 from torch import Tensor
 
 from invertwin.channel import Grid
-from invertwin.deprecation import rename_arguments
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, read_arrays
 
@@ -97,7 +96,6 @@ class DisplayMaps:
     power: Mapping[str, Float32[np.ndarray, "_ _ _"]]
 
     @classmethod
-    @rename_arguments(most="max_values")
     def from_spectra(
         cls, spectra: Mapping[str, Tensor], grid: Grid, max_values: int = _MAX_VALUES
     ) -> "DisplayMaps":

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from invertwin.capture import Capture
 from invertwin.channel import Grid
-from invertwin.deprecation import rename_arguments
 from invertwin.radar import Radar
 from invertwin.scene import Object, Scene, box
 from invertwin.scene.shape_models.density import replace_clouds
@@ -72,7 +71,6 @@ def display_mesh(item: Object) -> DisplayMesh:
     return DisplayMesh(to_float32(item.vertices), to_int32(item.mesh.faces))
 
 
-@rename_arguments(only="fitted_only")
 def scene_layers(
     scene: Scene, group: str = "twin", *, fitted: Collection[str] = (), fitted_only: bool = False
 ) -> list[DisplayLayer]:

@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.viewer import panels
 from invertwin.viewer.display import Display, DisplayStep
@@ -127,7 +126,6 @@ def _block_axis(centers: list[float], block: int) -> tuple[float, float]:
 _MAX_BYTES = 1_500_000  # of the steps on a page
 
 
-@rename_arguments(links="sensors")
 def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A whole page with a display.
 
@@ -146,7 +144,6 @@ def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
     )
 
 
-@rename_arguments(links="sensors")
 def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
     """A display as a part of a page; one page may hold it once.
 

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import import_optional, to_one_line
 from invertwin.scene import rigid, rotation_from_quaternion
 from invertwin.viewer import layers, surroundings
@@ -66,7 +65,6 @@ class Viewer:
         InputError: No `viser`, or a host without a token.
     """
 
-    @rename_arguments(links="sensors")
     def __init__(
         self,
         display: Display,

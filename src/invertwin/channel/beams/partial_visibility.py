@@ -22,7 +22,6 @@ from invertwin.channel.rays.scene_tables import connect_surfaces
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.checks import strip_derivatives
-from invertwin.deprecation import rename_arguments
 from invertwin.scene import Scene
 
 _PAIRS_AT_ONCE = 1 << 21  # edges × observers, or edges × cells, per chunk
@@ -76,7 +75,6 @@ class _ShadowingEdges(Rows):
     interval: Float64[Tensor, "row 2"]
 
 
-@rename_arguments(places="observers", width="blur")
 def visible_fractions(
     scene: Scene,
     observers: Float64[Tensor, "place 3"],

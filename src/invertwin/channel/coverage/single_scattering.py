@@ -46,7 +46,6 @@ from invertwin.channel.specular.trace_paths import (
 )
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Isotropic, Material, ScatteringLaw
@@ -100,7 +99,6 @@ class ScatteringPoints(Rows):
 PathLegs = tuple[list[image_method.SpecularPaths], list[image_method.SpecularPaths]]
 
 
-@rename_arguments(rough="scattering_scene", width="value_count")
 def trace_single_scattering(
     scene: Scene,
     scattering_scene: Scene,

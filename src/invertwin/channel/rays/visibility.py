@@ -22,7 +22,6 @@ from invertwin.channel.rays.ray_scene import Occluders
 from invertwin.channel.rays.scene_tables import connect_surfaces
 from invertwin.channel.rows import concatenate_rows
 from invertwin.checks import is_differentiated, strip_derivatives
-from invertwin.deprecation import rename_arguments
 from invertwin.scene.scene import Scene
 
 _Fractions = Float64[Tensor, " n"]
@@ -61,7 +60,6 @@ class ViewpointScene:
         InputError: A cloud in the scene.
     """
 
-    @rename_arguments(place="viewpoint")
     def __init__(self, scene: Scene, viewpoint: Float64[Tensor, "3"]) -> None:
         self.names = tuple(scene.objects)
         self._viewpoint = viewpoint

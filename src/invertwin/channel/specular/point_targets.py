@@ -18,14 +18,12 @@ from invertwin.channel.specular.ray_paths import RayPaths
 from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
 
 _UP = (0.0, 0.0, 1.0)  # vertical axis of V in ``RayPaths``
 
 
-@rename_arguments(sections="cross_sections")
 def trace_point_targets(
     scene: Scene,
     link: Link,

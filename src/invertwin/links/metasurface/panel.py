@@ -19,7 +19,6 @@ from torch.utils.checkpoint import checkpoint
 
 from invertwin import channel, checks
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
@@ -119,7 +118,6 @@ class Metasurface:
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
 
 
-@rename_arguments(width="blur", far="far_field")
 def panel_response(
     scene: Scene,
     panel: Metasurface,
@@ -202,7 +200,6 @@ def _element_waves(
     return torch.polar(visible / length, -wave_number * later), obliquity
 
 
-@rename_arguments(width="blur", far="far_field")
 def panel_paths(
     scene: Scene,
     panels: Metasurface | Sequence[Metasurface],

@@ -11,7 +11,6 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.checks import check_fields
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.limits import Count, Positive
 from invertwin.radar.radar import Radar, require_sampled_waveform
@@ -109,7 +108,6 @@ def check_order(order: Sequence[int], transmitters: int) -> list[int]:
     return list(order)
 
 
-@rename_arguments(places="trajectory")
 def moving_beat(
     paths: Paths,
     radar: Radar,

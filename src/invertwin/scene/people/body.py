@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, check_shape, checked_count, checked_tensor, set_fields
-from invertwin.deprecation import rename_arguments
 from invertwin.errors import InputError
 from invertwin.scene.mesh import Mesh, concatenate_meshes
 from invertwin.scene.parameters import Entries, ObjectModule, axes_mask, free_part
@@ -313,7 +312,6 @@ class SkinnedBody(ObjectModule):
             )
         return Mesh(self.template.apply_pose(rotations)[0], mesh.faces)
 
-    @rename_arguments(found="estimate")
     def joint_errors(self, estimate: Mesh, truth: Mesh) -> dict[str, float]:
         """Return the angles [rad] between the free joints of two meshes of the body, by name.
 
