@@ -204,6 +204,26 @@ class Paths(Rows):
         return concatenate_paths([self, other])
 
 
+def make_paths(
+    frame: Int64[Tensor, " path"],
+    delay: Tensor,
+    first: Tensor,
+    last: Tensor,
+    kind: str,
+    **given: Any,
+) -> Paths:
+    """Paths of one kind; power or coefficient that are not given are zero.
+
+    Args:
+        frame, delay, first, last, kind: What ``Paths`` holds.
+        given: Other columns; ``boundary`` is True if all of them are boundary paths.
+    """
+    zero, boundary = torch.zeros_like(delay), given.pop("boundary", False)
+    columns = {"coefficient": zero.to(torch.complex128), "power": zero} | given
+    ends = {"first": first, "last": last, "boundary": torch.full_like(frame, boundary).bool()}
+    return Paths(frame, delay, kind=kind, **ends, **columns)
+
+
 def concatenate_paths(parts: Sequence[Paths]) -> Paths:
     """All paths in order."""
     joined: dict[str, Any] = {}

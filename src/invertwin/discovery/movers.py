@@ -205,18 +205,9 @@ def point_response(
     away = (echo.position - origin) / distance
     place = (origin + (distance + echo.range_rate * time) * away)[None]
     length = (place - link.tx).norm(dim=1) + (place - link.rx).norm(dim=1)
-    point = Paths(
-        frame=torch.zeros(1, dtype=torch.int64),
-        delay=length / SPEED_OF_LIGHT,
-        coefficient=torch.zeros(1, dtype=torch.complex128),
-        power=torch.ones(1, dtype=torch.float64),
-        first=place,
-        last=place,
-        kind="power",
-        boundary=torch.zeros(1, dtype=torch.bool),
-        velocity=echo.range_rate * away[None],
-    )
-    return model.predict_paths(point, radar)
+    zero, one, velocity = torch.zeros(1), torch.ones_like(length), echo.range_rate * away[None]
+    columns = zero.long(), length / SPEED_OF_LIGHT, zero.cdouble(), one, place, place
+    return model.predict_paths(Paths(*columns, "power", zero.bool(), velocity), radar)
 
 
 def detect_strongest_target(

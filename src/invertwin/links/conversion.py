@@ -53,23 +53,18 @@ def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
     places = np.moveaxis(np.asarray(paths.vertices, dtype=np.float64), 0, -2)[valid]
     known = np.vectorize(_KINDS.__getitem__, otypes=[np.int64])(kinds) if kinds.size else kinds
     matrix = np.moveaxis(field, (0, 2, 4, 1, 3), (0, 1, 2, 3, 4))[valid]
-    found = RayPaths(
-        (valid.shape[1], valid.shape[0]),
-        float(frequency),
-        torch.from_numpy(tx),
-        torch.from_numpy(rx),
-        _rows(paths.tau, valid),
-        torch.from_numpy(np.ascontiguousarray(matrix)),
-        _unit_vectors(paths.theta_t, paths.phi_t, valid),
-        _unit_vectors(paths.theta_r, paths.phi_r, valid),
-        torch.from_numpy(np.where((known > 0)[..., None], places, 0.0)),
-        torch.from_numpy(known),
-        torch.full(known.shape, -1, dtype=torch.int64),
-        torch.full(known.shape, -1, dtype=torch.int64),
-        (),
-        _rows(paths.doppler, valid),
-    )
-    return found.sort_rows()
+    delay, doppler = _rows(paths.tau, valid), _rows(paths.doppler, valid)
+    departure = _unit_vectors(paths.theta_t, paths.phi_t, valid)
+    arrival = _unit_vectors(paths.theta_r, paths.phi_r, valid)
+    points = np.where((known > 0)[..., None], places, 0.0)
+    unknown_surface = torch.full(known.shape, -1, dtype=torch.int64)
+    arrays = tx, rx, np.ascontiguousarray(matrix), points, known
+    sources, targets, field, vertices, kinds = (torch.from_numpy(array) for array in arrays)
+    columns = sources, targets, delay, field, departure, arrival, vertices, kinds
+    where = unknown_surface, unknown_surface, (), doppler
+    return RayPaths(
+        (valid.shape[1], valid.shape[0]), float(frequency), *columns, *where
+    ).sort_rows()
 
 
 def _rows(values: Any, valid: np.ndarray) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from invertwin.channel.beams.facet_paths import trace_facet_paths
 from invertwin.channel.beams.partial_visibility import PanelCells, visible_fractions
 from invertwin.channel.em.plane_waves import cross, orthogonal_unit_vectors
-from invertwin.channel.paths import Link, Paths, concatenate_paths
+from invertwin.channel.paths import Link, Paths, concatenate_paths, make_paths
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -155,13 +155,5 @@ def _midway_power_paths(paths: Paths, one: Tensor, other: Tensor, power: Tensor)
     def midpoint(values: Tensor) -> Tensor:
         return 0.5 * (values[one] + values[other])
 
-    return Paths(
-        frame=paths.frame[one],
-        delay=midpoint(paths.delay),
-        coefficient=torch.zeros_like(paths.coefficient[one]),
-        power=power,
-        first=midpoint(paths.first),
-        last=midpoint(paths.last),
-        kind="power",
-        boundary=torch.zeros(len(one), dtype=torch.bool),
-    )
+    middle = (midpoint(column) for column in (paths.delay, paths.first, paths.last))
+    return make_paths(paths.frame[one], *middle, kind="power", power=power)

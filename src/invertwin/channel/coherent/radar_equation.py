@@ -9,14 +9,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Complex128, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import triangle_normals
-from invertwin.channel.paths import Link, Paths
+from invertwin.channel.paths import Link, Paths, make_paths
 from invertwin.channel.rays.ray_scene import RayScene, find_passed_sheets
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
 from invertwin.channel.rows import Rows
@@ -94,34 +95,15 @@ class PathTransfer:
     length: Float64[Tensor, " n"]
     depolarisation: Sequence[Float64[Tensor, " n"]]
 
-    def to_paths(
-        self,
-        kind: str,
-        *,
-        power: Float64[Tensor, " n"] | None = None,
-        coefficient: Complex128[Tensor, " n"] | None = None,
-        matrix: Complex128[Tensor, "n r t"] | None = None,
-        boundary: bool = False,
-        velocity: Float64[Tensor, "n 3"] | None = None,
-    ) -> Paths:
-        """Paths of one kind, see ``Paths``; power or coefficient that are not given are zero.
+    def to_paths(self, kind: str, **given: Any) -> Paths:
+        """Paths of one kind.
 
         Args:
-            kind, power, coefficient, matrix, velocity: What ``Paths`` holds.
-            boundary: Whether all of them are boundary paths.
+            kind, given: See ``make_paths``.
         """
-        zero = torch.zeros(len(self.frame), dtype=torch.float64)
-        return Paths(
-            frame=self.frame,
-            delay=self.length / SPEED_OF_LIGHT,
-            coefficient=zero.to(torch.complex128) if coefficient is None else coefficient,
-            power=zero if power is None else power,
-            first=self.points[0].position,
-            last=self.points[-1].position,
-            kind=kind,
-            boundary=torch.full((len(self.frame),), boundary),
-            velocity=velocity,
-            matrix=matrix,
+        delay, ends = self.length / SPEED_OF_LIGHT, (self.points[0], self.points[-1])
+        return make_paths(
+            self.frame, delay, *(point.position for point in ends), kind=kind, **given
         )
 
 

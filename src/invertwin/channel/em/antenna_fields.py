@@ -5,7 +5,7 @@ from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.em.plane_waves import cross, polarisations
-from invertwin.channel.paths import Link, Paths
+from invertwin.channel.paths import Link, Paths, make_paths
 from invertwin.scene.polarisation import Polarisation
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)  # of the radar
@@ -98,6 +98,5 @@ def coherent_paths(
         fields: coefficients between the Jones vectors of both arrays.
     """
     coefficient, matrix = combine_elements(link, fields)
-    zero, boundary = torch.zeros_like(delay), torch.zeros_like(frame, dtype=torch.bool)
-    columns = frame, delay, coefficient, zero, first, last
-    return Paths(*columns, kind="coherent", boundary=boundary, matrix=matrix)
+    columns = frame, delay, first, last, "coherent"
+    return make_paths(*columns, coefficient=coefficient, matrix=matrix)

@@ -256,7 +256,7 @@ def _paths_over_panel(
     names: tuple[str, ...],
 ) -> channel.RayPaths:
     """One path over a panel for each pair of antennas between which it passes something on."""
-    total, (senders, hearers) = response.ravel(), response.shape
+    total, hearers = response.ravel(), response.shape[1]
     link = torch.nonzero(total.detach() != 0)[:, 0]
     source, target = link // hearers, link % hearers
     ways = [panel.position - ends[0][source], panel.position - ends[1][target]]
@@ -266,22 +266,13 @@ def _paths_over_panel(
     )
     normal = panel.axes[:, 0]
     turned = sent - 2 * (sent @ normal)[..., None] * normal
+    delay = (ways[0].norm(dim=1) + ways[1].norm(dim=1)) / SPEED_OF_LIGHT
+    field = total[link, None, None] * (received @ turned.mT)
     one = torch.ones(len(link), 1, dtype=torch.int64)
+    points, kinds = panel.position.expand(len(link), 1, 3), channel.METASURFACE * one
+    columns = source, target, delay, field, units[0], units[1], points, kinds, -one, -one
     return channel.RayPaths(
-        (senders, hearers),
-        frequency,
-        source,
-        target,
-        (ways[0].norm(dim=1) + ways[1].norm(dim=1)) / SPEED_OF_LIGHT,
-        total[link, None, None] * (received @ turned.mT),
-        units[0],
-        units[1],
-        panel.position.expand(len(link), 1, 3),
-        channel.METASURFACE * one,
-        -one,
-        -one,
-        names,
-        torch.zeros(len(link), dtype=torch.float64),
+        (len(response), hearers), frequency, *columns, names, torch.zeros_like(delay)
     )
 
 
