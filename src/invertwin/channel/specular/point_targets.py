@@ -92,10 +92,27 @@ def _echo_paths(
     returning = fields_at_target(link, numbers, inbound, transmits=False)
     # The target preserves the field vector in world axes.
     matrix = returning @ outgoing.mT * strength[outbound.rx][:, None, None]
-    # Array elements see the target at its image.
+    return join_legs(link, outbound, inbound, numbers, matrix)
+
+
+def join_legs(
+    link: Link,
+    outbound: RayPaths,
+    inbound: RayPaths,
+    frame: Int64[Tensor, " row"],
+    fields: Complex128[Tensor, "row r t"],
+) -> Paths:
+    """Coherent paths over pairs of legs to the same points, which array elements see at the images.
+
+    Args:
+        link: antennas.
+        outbound, inbound: legs to the point from the transmitter, and from the receiver.
+        frame: radar pose of each pair.
+        fields: coefficients between the Jones vectors of both arrays.
+    """
     first = link.tx[frame] + outbound.length[:, None] * outbound.departure
     last = link.rx[frame] + inbound.length[:, None] * inbound.departure
-    return coherent_paths(link, numbers, outbound.delay + inbound.delay, matrix, first, last)
+    return coherent_paths(link, frame, outbound.delay + inbound.delay, fields, first, last)
 
 
 def fields_at_target(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, draw_speckle, trace_field
+from invertwin.channel.coverage.mirrors import deposit_mirrored_power, trace_field_with_mirrors
 from invertwin.channel.coverage.single_scattering import without_specular
 from invertwin.errors import InputError
 from invertwin.scene import (
@@ -24,7 +25,6 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
-from invertwin_studies.mirrors import deposit_mirrored_power, trace_field_with_mirrors
 from scenes import float64
 
 WAVELENGTH = 0.004

@@ -1,0 +1,280 @@
+"""Echoes by mirrors: smooth flat surfaces that reflect before and after one scattering (ghosts).
+
+A target beside a smooth wall is seen four times: directly, behind the wall by the two mixed paths
+and by the wall on both legs. Paths by mirrors alone are added: the flash of the wall itself. The
+legs are specular paths (``specular.trace_paths``), by the Fresnel coefficients of each
+polarisation; array elements see a target behind a mirror at its image.
+
+Source: the radar equation with the legs of derivations §10; boundary terms of derivations §3 and
+§11.
+"""
+
+import math
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
+from itertools import product
+
+import torch
+from jaxtyping import Complex128, Float32, Float64, Int64
+from torch import Tensor
+
+from invertwin.channel.coherent import radar_equation
+from invertwin.channel.coherent.field import trace_field
+from invertwin.channel.coherent.multibounce_po import sample_surface_points
+from invertwin.channel.coherent.speckle import Speckle, draw_speckle
+from invertwin.channel.coverage import single_scattering
+from invertwin.channel.em import antenna_fields
+from invertwin.channel.em.depolarisation import random_scattering_matrix
+from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.paths import Grid, Link, Paths, concatenate_paths
+from invertwin.channel.power.bins import deposit_paths
+from invertwin.channel.rays import ray_scene, scene_tables
+from invertwin.channel.rays.backend import tracing
+from invertwin.channel.sampling import Sampling
+from invertwin.channel.specular import image_method, point_targets, trace_paths
+from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
+from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.errors import InputError
+from invertwin.runtime.concurrency import torch_threads
+from invertwin.scene import Scene
+from invertwin.scene.material.fresnel import FieldCoefficients
+
+_Pairs = single_scattering.ScatteredPairs
+_Maps = Float32[Tensor, "frame range u v"]
+
+#: Paths over pairs of legs to points, with power or fields.
+_Evaluation = Callable[
+    [Link, _Pairs, radar_equation.MaterialPoints, radar_equation.SurfacePaths], Paths
+]
+
+_SEARCH_RAYS = 100_000
+_FEW_TRIANGLES = 48  # that reflect or transmit: every sequence of their planes is tested
+_RAYS_PER_POINT = 64  # rays of power paths at the cost of one point
+
+
+def deposit_mirrored_power(
+    scene: Scene, link: Link, grid: Grid, mirrors: Collection[str], *, sampling: Sampling, seed: int
+) -> _Maps:
+    """Compute the expected power of echoes by mirrors in every bin of a map, per frame.
+
+    Add the map of ``deposit_power`` of ``without_specular(scene, mirrors)``. Differentiable with
+    respect to the scene, its materials and the antennas, moving boundaries of shadows and of
+    mirrors included.
+
+    Args:
+        scene: scene with surfaces.
+        link: antennas, per frame.
+        grid: bins of one frame.
+        mirrors: names of the smooth flat objects that reflect.
+        sampling: numbers of points and of edge points; ``depth`` is the maximum number of surfaces
+            on a path, the one that scatters included.
+        seed: random seed of the points.
+
+    Raises:
+        InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
+            motion; derivatives where a moving surface touches one that scatters.
+    """
+
+    def deposit(pairs: _Pairs) -> Tensor:
+        return deposit_paths(_pair_powers(link, pairs), link, grid)
+
+    with tracing(sampling.backend), torch_threads(1):
+        search = _MirrorSearch(scene, link, mirrors, sampling, seed)
+        scattered = search.tracer.sum_pairs(search.stage, search.geometry, deposit)
+        maps = [deposit_paths(paths, link, grid) for paths in search.trace_flash()]
+    maps += [] if scattered is None else [scattered]
+    return torch.stack(maps).sum(0) if maps else torch.zeros(link.frame_count, *grid.shape)
+
+
+def trace_field_with_mirrors(
+    scene: Scene,
+    link: Link,
+    mirrors: Collection[str],
+    *,
+    sampling: Sampling,
+    seed: int,
+    speckle: Speckle | None = None,
+) -> Paths:
+    """Trace field paths as ``trace_field``, and those by mirrors.
+
+    Conductors scatter by physical optics, rough surfaces by their fixed points with the phases that
+    they have in direct echoes.
+
+    Args:
+        scene: scene with surfaces.
+        link: antennas, per frame.
+        mirrors: names of the smooth flat objects that reflect; without any, ``trace_field``.
+        sampling: numbers of points; ``depth`` is the maximum number of surfaces on a path.
+        seed: random seed of the points.
+        speckle: rough points; None draws them.
+
+    Raises:
+        InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
+            motion; derivatives with respect to geometry with ``boundary``, which single points
+            lack; and errors of ``trace_field``.
+    """
+    rest = single_scattering.without_specular(scene, mirrors)
+    direct = trace_field(rest, link, sampling=sampling, seed=seed, speckle=speckle)
+    if not mirrors:
+        return direct
+    with tracing(sampling.backend), torch_threads(1):
+        search = _MirrorSearch(scene, link, mirrors, sampling, seed)
+        geometry, frames = search.geometry, range(link.frame_count)
+        if sampling.boundary and scene_tables.is_visibility_differentiated(geometry, link):
+            raise InputError(
+                "expected no geometry derivative of fields by mirrors, got one: single points "
+                "appear and vanish; use power paths, or boundary=False for fixed visibility"
+            )
+        found = [direct, *search.trace_flash()]
+        smooth = torch.tensor(geometry.coherent)[geometry.face_object]
+        if bool(smooth.any()):
+            areas, count = ray_scene.face_areas(geometry), sampling.count_conductor_samples()
+            points = sample_surface_points(areas * smooth, count, seed)
+            found += search.trace_points(points, frames, _conductor_fields)
+        rough = search.tracer.is_scattering & ~smooth
+        if bool(rough.any()):
+            fixed = (speckle or draw_speckle(rest, link, sampling, seed)).points
+            own = fixed.select(rough[fixed.face[:, 0]])
+            found += search.trace_points(own, frames, _rough_fields)
+    return concatenate_paths(found)
+
+
+class _MirrorSearch:
+    """Search for legs between the antennas of each frame and surfaces, by the mirrors alone."""
+
+    def __init__(
+        self, scene: Scene, link: Link, mirrors: Collection[str], sampling: Sampling, seed: int
+    ) -> None:
+        frequency = SPEED_OF_LIGHT / link.wavelength
+        for name in mirrors:
+            skin = scene[name].material.smooth_interface(frequency)
+            if skin is None or not bool((skin.coherence > 0).any()):
+                raise InputError(
+                    f"expected mirrors that reflect a coherent wave, got {name!r}, all of whose "
+                    "power is scattered; give it a Slab, a PerfectConductor, or "
+                    "Dielectric(scattering=0)"
+                )
+        rest = single_scattering.without_specular(scene, mirrors)
+        self.link, self.geometry = link, scene_tables.flatten(rest, link.wavelength)
+        flat = scene
+        for name in set(scene.names) - set(mirrors):
+            flat = flat.replace(name, material=_NonReflecting(scene[name].material))
+        self.stage = trace_paths.prepare_path_scene(flat, link.tx, link.rx, frequency)
+        active = trace_paths.face_interactions(self.stage)
+        few = int((active.reflect | active.transmit).sum()) <= _FEW_TRIANGLES
+        drawn = replace(sampling, samples=max(1, sampling.samples // _RAYS_PER_POINT))
+        pairing: single_scattering.Pairing = "monostatic" if link.shared_visibility else "frames"
+        how = None if few else _SEARCH_RAYS, drawn, seed, pairing
+        self.tracer = single_scattering.SingleScatteringTracer(self.stage, self.geometry, *how)
+
+    def trace_flash(self) -> list[Paths]:
+        """Paths by mirrors alone, with field and power; none without any."""
+        tracer, (ends, others) = self.tracer, self.tracer.antennas
+        found, number = list[RayPaths](), torch.arange(len(ends))
+        for steps in tracer.sequences[0]:
+            parts = image_method.find_paths_from(tracer.surfaces, steps, ends, number, others)
+            found += [p for some in parts for p in trace_paths.evaluate_paths(self.stage, some)]
+        if not found:
+            return []
+        out = join_ray_paths(found)
+        back = replace(out, departure=out.arrival, arrival=out.departure)
+        sent, received = (_amplitudes(self.link, out, True), _amplitudes(self.link, back, False))
+        fields = torch.einsum("nri,nij,ntj->nrt", received, out.coefficient, sent)
+        flash = point_targets.join_legs(self.link, out, back, out.tx, fields)
+        power = flash.coefficient.abs().square()
+        return [replace(flash, delay=out.delay, power=power)]
+
+    def trace_points(
+        self, points: radar_equation.SurfacePaths, frames: Iterable[int], evaluate: _Evaluation
+    ) -> list[Paths]:
+        """Paths by mirrors over single points in some frames, with their fields or powers."""
+        found: list[Paths] = []
+        rows = torch.arange(len(points.weight)).split(single_scattering.POINTS_AT_ONCE)
+        for frame, row in product(frames, rows):
+            some = points.select(row)
+            sample = single_scattering.ScatteringPoints(torch.full_like(row, frame), some)
+            place = some.material_points(self.geometry)[0]
+            legs, area = self.tracer.find_legs(sample, self.geometry), some.weight * place.jacobian
+            how = self.stage, self.geometry, legs, place, area
+            pairs, index = self.tracer.evaluate_pairs(*how)
+            paths = evaluate(self.link, pairs, place.select(index), some.select(index))
+            found.append(paths.select(paths.has_field | (paths.power > 0)))
+        return found
+
+
+def _pair_powers(
+    link: Link,
+    pairs: _Pairs,
+    *_: radar_equation.MaterialPoints | radar_equation.SurfacePaths,
+) -> Paths:
+    """Paths with the powers of pairs of legs, of the mean elements of both antennas."""
+    legs = pairs.outbound, pairs.inbound
+    sent, received = (
+        torch.einsum("k,nki->ni", jones.mean, _amplitudes(link, leg, transmits))[:, None]
+        for leg, transmits, jones in zip(
+            legs, (True, False), (link.tx_jones, link.rx_jones), strict=True
+        )
+    )
+    unit = single_scattering.scattered_power(*legs, sent, received, pairs.depolarisation)
+    none = torch.zeros(len(unit), 1, 1, dtype=torch.complex128)
+    paths = point_targets.join_legs(link, *legs, legs[0].tx, none)
+    return replace(paths, power=unit * pairs.weight, kind="power")
+
+
+def _rough_fields(
+    link: Link,
+    pairs: _Pairs,
+    _: radar_equation.MaterialPoints,
+    points: radar_equation.SurfacePaths,
+) -> Paths:
+    """Paths with fields of rough points: the root of their power, with the points' phases."""
+    positive = pairs.weight > 0  # a root of zero has no derivative
+    root = torch.where(positive, torch.where(positive, pairs.weight, 1.0).sqrt(), 0.0)
+    scattering = random_scattering_matrix([pairs.depolarisation], points.phase)
+    legs = pairs.outbound, pairs.inbound
+    sent, received = (
+        torch.einsum("nij,nkj->nki", leg.coefficient, _amplitudes(link, leg, transmits))
+        for leg, transmits in zip(legs, (True, False), strict=True)
+    )
+    phasor = torch.polar(root, points.phase)[:, None, None]
+    fields = phasor * (received @ scattering @ sent.mT)
+    return point_targets.join_legs(link, *legs, legs[0].tx, fields)
+
+
+def _conductor_fields(
+    link: Link,
+    pairs: _Pairs,
+    place: radar_equation.MaterialPoints,
+    points: radar_equation.SurfacePaths,
+) -> Paths:
+    """Paths with fields of conductors by physical optics."""
+    outbound, inbound = pairs.outbound, pairs.inbound
+    normal = dot(place.normal, outbound.arrival).sign()[:, None] * place.normal
+    sent, received = (
+        point_targets.fields_at_target(link, leg.tx, leg, transmits=transmits)
+        for leg, transmits in ((outbound, True), (inbound, False))
+    )
+    kernel = antenna_fields.current_kernel(
+        normal, -outbound.arrival, sent, -inbound.arrival, received
+    )
+    area = points.weight * place.jacobian
+    spread = torch.full_like(area, (4 * math.pi / link.wavelength) ** 4)
+    field = antenna_fields.conductor_field(spread, kernel, dot(normal, inbound.arrival))
+    fields = field * area[:, None, None]
+    return point_targets.join_legs(link, outbound, inbound, outbound.tx, fields)
+
+
+def _amplitudes(link: Link, legs: RayPaths, transmits: bool) -> Complex128[Tensor, "row k 2"]:
+    return point_targets.antenna_amplitudes(link, legs.tx, legs, transmits=transmits)
+
+
+@dataclass(frozen=True)
+class _NonReflecting(single_scattering.IncoherentMaterial):
+    """A material whose coherent wave passes as it is, but is not reflected."""
+
+    def coefficients(
+        self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
+    ) -> FieldCoefficients:
+        """Return coefficients without reflection. See ``Material.coefficients``."""
+        found = self.base.coefficients(frequency, cosine, triangle)
+        return found.scale_reflection(torch.zeros_like(cosine))
