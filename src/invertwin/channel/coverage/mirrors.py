@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from jaxtyping import Complex128, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.coherent import radar_equation
@@ -41,11 +41,8 @@ from invertwin.scene.material.fresnel import FieldCoefficients
 
 _Pairs = single_scattering.ScatteredPairs
 _Maps = Float32[Tensor, "frame range u v"]
-
-#: Paths over pairs of legs to points, with power or fields.
-_Evaluation = Callable[
-    [Link, _Pairs, radar_equation.MaterialPoints, radar_equation.SurfacePaths], Paths
-]
+_Places = radar_equation.MaterialPoints
+_Points = radar_equation.SurfacePaths
 
 _SEARCH_RAYS = 100_000
 _FEW_TRIANGLES = 48  # that reflect or transmit: every sequence of their planes is tested
@@ -74,12 +71,12 @@ def deposit_mirrored_power(
         InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
             motion; derivatives where a moving surface touches one that scatters.
     """
-
-    def deposit(pairs: _Pairs) -> Tensor:
-        return deposit_paths(_pair_powers(link, pairs), link, grid)
-
     with tracing(sampling.backend), torch_threads(1):
         search = _MirrorSearch(scene, link, mirrors, sampling, seed)
+
+        def deposit(pairs: _Pairs) -> Tensor:
+            return deposit_paths(search.pair_powers(pairs), link, grid)
+
         scattered = search.tracer.sum_pairs(search.stage, search.geometry, deposit)
         maps = [deposit_paths(paths, link, grid) for paths in search.trace_flash()]
     maps += [] if scattered is None else [scattered]
@@ -130,12 +127,12 @@ def trace_field_with_mirrors(
         if bool(smooth.any()):
             areas, count = ray_scene.face_areas(geometry), sampling.count_conductor_samples()
             points = sample_surface_points(areas * smooth, count, seed)
-            found += search.trace_points(points, frames, _conductor_fields)
+            found += search.trace_points(points, frames, search.conductor_fields)
         rough = search.tracer.is_scattering & ~smooth
         if bool(rough.any()):
             fixed = (speckle or draw_speckle(rest, link, sampling, seed)).points
             own = fixed.select(rough[fixed.face[:, 0]])
-            found += search.trace_points(own, frames, _rough_fields)
+            found += search.trace_points(own, frames, search.rough_fields)
     return concatenate_paths(found)
 
 
@@ -178,14 +175,17 @@ class _MirrorSearch:
             return []
         out = join_ray_paths(found)
         back = replace(out, departure=out.arrival, arrival=out.departure)
-        sent, received = (_amplitudes(self.link, out, True), _amplitudes(self.link, back, False))
+        sent, received = _amplitudes(self.link, out, back)
         fields = torch.einsum("nri,nij,ntj->nrt", received, out.coefficient, sent)
-        flash = point_targets.join_legs(self.link, out, back, out.tx, fields)
+        flash = point_targets.join_legs(self.link, out, back, fields)
         power = flash.coefficient.abs().square()
         return [replace(flash, delay=out.delay, power=power)]
 
     def trace_points(
-        self, points: radar_equation.SurfacePaths, frames: Iterable[int], evaluate: _Evaluation
+        self,
+        points: _Points,
+        frames: Iterable[int],
+        evaluate: Callable[[_Pairs, _Places, _Points], Paths],
     ) -> list[Paths]:
         """Paths by mirrors over single points in some frames, with their fields or powers."""
         found: list[Paths] = []
@@ -197,75 +197,50 @@ class _MirrorSearch:
             legs, area = self.tracer.find_legs(sample, self.geometry), some.weight * place.jacobian
             how = self.stage, self.geometry, legs, place, area
             pairs, index = self.tracer.evaluate_pairs(*how)
-            paths = evaluate(self.link, pairs, place.select(index), some.select(index))
+            paths = evaluate(pairs, place.select(index), some.select(index))
             found.append(paths.select(paths.has_field | (paths.power > 0)))
         return found
 
+    def pair_powers(self, pairs: _Pairs, *_: _Places | _Points) -> Paths:
+        """Paths with the powers of pairs of legs, of the mean elements of both antennas."""
+        legs = pairs.outbound, pairs.inbound
+        sent, received = _amplitudes(self.link, *legs)
+        sent = torch.einsum("k,nki->ni", self.link.tx_jones.mean, sent)[:, None]
+        received = torch.einsum("k,nki->ni", self.link.rx_jones.mean, received)[:, None]
+        unit = single_scattering.scattered_power(*legs, sent, received, pairs.depolarisation)
+        none = torch.zeros(len(unit), 1, 1, dtype=torch.complex128)
+        paths = point_targets.join_legs(self.link, *legs, none)
+        return replace(paths, power=unit * pairs.weight, kind="power")
 
-def _pair_powers(
-    link: Link,
-    pairs: _Pairs,
-    *_: radar_equation.MaterialPoints | radar_equation.SurfacePaths,
-) -> Paths:
-    """Paths with the powers of pairs of legs, of the mean elements of both antennas."""
-    legs = pairs.outbound, pairs.inbound
-    sent, received = (
-        torch.einsum("k,nki->ni", jones.mean, _amplitudes(link, leg, transmits))[:, None]
-        for leg, transmits, jones in zip(
-            legs, (True, False), (link.tx_jones, link.rx_jones), strict=True
-        )
-    )
-    unit = single_scattering.scattered_power(*legs, sent, received, pairs.depolarisation)
-    none = torch.zeros(len(unit), 1, 1, dtype=torch.complex128)
-    paths = point_targets.join_legs(link, *legs, legs[0].tx, none)
-    return replace(paths, power=unit * pairs.weight, kind="power")
+    def rough_fields(self, pairs: _Pairs, _: _Places, points: _Points) -> Paths:
+        """Paths with fields of rough points: the root of their power, with the points' phases."""
+        positive = pairs.weight > 0  # a root of zero has no derivative
+        root = torch.where(positive, torch.where(positive, pairs.weight, 1.0).sqrt(), 0.0)
+        phasor = torch.polar(root, points.phase)[:, None, None]
+        scattering = phasor * random_scattering_matrix([pairs.depolarisation], points.phase)
+        out, back = pairs.outbound, pairs.inbound
+        sent, received = _amplitudes(self.link, out, back)
+        fields = received @ back.coefficient.mT @ scattering @ out.coefficient @ sent.mT
+        return point_targets.join_legs(self.link, out, back, fields)
 
-
-def _rough_fields(
-    link: Link,
-    pairs: _Pairs,
-    _: radar_equation.MaterialPoints,
-    points: radar_equation.SurfacePaths,
-) -> Paths:
-    """Paths with fields of rough points: the root of their power, with the points' phases."""
-    positive = pairs.weight > 0  # a root of zero has no derivative
-    root = torch.where(positive, torch.where(positive, pairs.weight, 1.0).sqrt(), 0.0)
-    scattering = random_scattering_matrix([pairs.depolarisation], points.phase)
-    legs = pairs.outbound, pairs.inbound
-    sent, received = (
-        torch.einsum("nij,nkj->nki", leg.coefficient, _amplitudes(link, leg, transmits))
-        for leg, transmits in zip(legs, (True, False), strict=True)
-    )
-    phasor = torch.polar(root, points.phase)[:, None, None]
-    fields = phasor * (received @ scattering @ sent.mT)
-    return point_targets.join_legs(link, *legs, legs[0].tx, fields)
+    def conductor_fields(self, pairs: _Pairs, place: _Places, points: _Points) -> Paths:
+        """Paths with fields of conductors by physical optics."""
+        out, back = pairs.outbound, pairs.inbound
+        normal = dot(place.normal, out.arrival).sign()[:, None] * place.normal
+        sent = point_targets.fields_at_target(self.link, out, transmits=True)
+        received = point_targets.fields_at_target(self.link, back, transmits=False)
+        waves = -out.arrival, sent, -back.arrival, received
+        area = points.weight * place.jacobian
+        spread = area**2 * (4 * math.pi / self.link.wavelength) ** 4
+        kernel = antenna_fields.current_kernel(normal, *waves)
+        fields = antenna_fields.conductor_field(spread, kernel, dot(normal, back.arrival))
+        return point_targets.join_legs(self.link, out, back, fields)
 
 
-def _conductor_fields(
-    link: Link,
-    pairs: _Pairs,
-    place: radar_equation.MaterialPoints,
-    points: radar_equation.SurfacePaths,
-) -> Paths:
-    """Paths with fields of conductors by physical optics."""
-    outbound, inbound = pairs.outbound, pairs.inbound
-    normal = dot(place.normal, outbound.arrival).sign()[:, None] * place.normal
-    sent, received = (
-        point_targets.fields_at_target(link, leg.tx, leg, transmits=transmits)
-        for leg, transmits in ((outbound, True), (inbound, False))
-    )
-    kernel = antenna_fields.current_kernel(
-        normal, -outbound.arrival, sent, -inbound.arrival, received
-    )
-    area = points.weight * place.jacobian
-    spread = torch.full_like(area, (4 * math.pi / link.wavelength) ** 4)
-    field = antenna_fields.conductor_field(spread, kernel, dot(normal, inbound.arrival))
-    fields = field * area[:, None, None]
-    return point_targets.join_legs(link, outbound, inbound, outbound.tx, fields)
-
-
-def _amplitudes(link: Link, legs: RayPaths, transmits: bool) -> Complex128[Tensor, "row k 2"]:
-    return point_targets.antenna_amplitudes(link, legs.tx, legs, transmits=transmits)
+def _amplitudes(link: Link, outbound: RayPaths, inbound: RayPaths) -> tuple[Tensor, Tensor]:
+    """Amplitudes of the elements of both antennas along legs, [row, element, 2]."""
+    sent = point_targets.antenna_amplitudes(link, outbound, transmits=True)
+    return sent, point_targets.antenna_amplitudes(link, inbound, transmits=False)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ and the target (``specular.trace_paths``).
 import math
 
 import torch
-from jaxtyping import Complex128, Float64, Int64
+from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel.em.antenna_fields import antenna_fields, coherent_paths
@@ -79,71 +79,61 @@ def trace_point_targets(
     for frame in range(link.frame_count):
         own = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
         first, last = torch.nonzero(own[0].rx[:, None] == own[1].rx).unbind(1)
-        found.append(_echo_paths(link, frame, own[0].select(first), own[1].select(last), strength))
+        pair = own[0].select(first), own[1].select(last)
+        outgoing, returning = (
+            fields_at_target(link, leg, transmits=transmits)
+            for leg, transmits in zip(pair, (True, False), strict=True)
+        )
+        # The target preserves the field vector in world axes.
+        fields = returning @ outgoing.mT * strength[pair[0].rx][:, None, None]
+        found.append(join_legs(link, *pair, fields))
     return concatenate_paths(found)
 
 
-def _echo_paths(
-    link: Link, frame: int, outbound: RayPaths, inbound: RayPaths, strength: Tensor
-) -> Paths:
-    """Echo of each pair of legs, both given from their antenna to the target."""
-    numbers = torch.full((len(outbound),), frame)
-    outgoing = fields_at_target(link, numbers, outbound, transmits=True)
-    returning = fields_at_target(link, numbers, inbound, transmits=False)
-    # The target preserves the field vector in world axes.
-    matrix = returning @ outgoing.mT * strength[outbound.rx][:, None, None]
-    return join_legs(link, outbound, inbound, numbers, matrix)
-
-
 def join_legs(
-    link: Link,
-    outbound: RayPaths,
-    inbound: RayPaths,
-    frame: Int64[Tensor, " row"],
-    fields: Complex128[Tensor, "row r t"],
+    link: Link, outbound: RayPaths, inbound: RayPaths, fields: Complex128[Tensor, "row r t"]
 ) -> Paths:
     """Coherent paths over pairs of legs to the same points, which array elements see at the images.
 
     Args:
-        link: antennas.
+        link: antennas; those of a frame have its number.
         outbound, inbound: legs to the point from the transmitter, and from the receiver.
-        frame: radar pose of each pair.
         fields: coefficients between the Jones vectors of both arrays.
     """
-    first = link.tx[frame] + outbound.length[:, None] * outbound.departure
-    last = link.rx[frame] + inbound.length[:, None] * inbound.departure
-    return coherent_paths(link, frame, outbound.delay + inbound.delay, fields, first, last)
+    first = link.tx[outbound.tx] + outbound.length[:, None] * outbound.departure
+    last = link.rx[inbound.tx] + inbound.length[:, None] * inbound.departure
+    delay = outbound.delay + inbound.delay
+    return coherent_paths(link, outbound.tx, delay, fields, first, last)
 
 
 def fields_at_target(
-    link: Link, frame: Int64[Tensor, " row"], legs: RayPaths, *, transmits: bool
+    link: Link, legs: RayPaths, *, transmits: bool
 ) -> Complex128[Tensor, "row k 3"]:
     """Fields that an antenna's vectors radiate to the ends of legs, in world axes.
 
     By reciprocity, also those that it receives from there.
 
     Args:
-        link: antennas.
-        frame: radar pose of each leg.
+        link: antennas; those of a frame have its number.
         legs: from the antenna to its target.
         transmits: True for the transmitter, False for the receiver.
     """
-    amplitudes = antenna_amplitudes(link, frame, legs, transmits=transmits)
+    amplitudes = antenna_amplitudes(link, legs, transmits=transmits)
     axes = _polarisation_axes(legs.arrival).to(amplitudes.dtype)
     return torch.einsum("nij,nkj,nix->nkx", legs.coefficient, amplitudes, axes)
 
 
 def antenna_amplitudes(
-    link: Link, frame: Int64[Tensor, " row"], legs: RayPaths, *, transmits: bool
+    link: Link, legs: RayPaths, *, transmits: bool
 ) -> Complex128[Tensor, "row k 2"]:
     """Field amplitudes of an antenna's vectors along legs, in V and H of ``RayPaths``.
 
     Args:
-        link, frame, legs, transmits: as of ``fields_at_target``.
+        link, legs, transmits: as of ``fields_at_target``.
     """
     pattern = link.tx_pattern if transmits else link.rx_pattern
     jones = link.tx_jones if transmits else link.rx_jones
-    rotation = link.rotations[frame]
+    rotation = link.rotations[legs.tx]
     gain = pattern.gain(torch.einsum("nij,ni->nj", rotation, legs.departure))
     positive = gain > 0  # the square root has no derivative at zero
     strength = torch.where(positive, torch.where(positive, gain, 1.0).sqrt(), 0.0)
