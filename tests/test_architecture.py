@@ -77,7 +77,7 @@ INSIDE = {
         "coherent": {"em", "rays", "power"},
         "beams": {"em", "rays"},
         "specular": {"em", "rays"},
-        "coverage": {"em", "rays", "coherent", "specular"},
+        "coverage": {"em", "rays", "power", "coherent", "specular"},
         "rcs": {"em", "rays", "beams"},
     },
     "cli": {"schema": set(), "fits": {"schema"}, "commands": {"schema", "fits"}},

@@ -8,6 +8,7 @@ aspect give images.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -185,25 +186,14 @@ def rcs(
     _require_dielectrics(scene)
     require_single_surfaces(scene)
     tubes = checks.checked_number(tubes_per_wavelength, "tubes per wavelength", 0.0, open_low=True)
-    parts = trace_far_field(
-        scene,
-        transmitters,
-        receiver_directions,
-        sweep,
-        depth=checks.checked_count(depth, "depth", 1),
-        edges=checks.checked_count(edges, "edges", 0),
-        tubes_per_wavelength=tubes,
-        up=axis / axis.norm(),
-        boundary=boundary,
-    )
+    counts = checks.checked_count(depth, "depth", 1), checks.checked_count(edges, "edges", 0)
+    how: dict[str, Any] = {"up": axis / axis.norm(), "boundary": boundary}
+    how |= {"depth": counts[0], "edges": counts[1], "tubes_per_wavelength": tubes}
+    parts = trace_far_field(scene, transmitters, receiver_directions, sweep, **how)
     basis = jones_basis(polarisation)
     rotated = {name: basis.T @ value @ basis for name, value in parts.items()}
-    return Signature(
-        rotated,
-        sweep,
-        transmitters,
-        transmitters if receiver_directions is None else receiver_directions,
-    )
+    received = transmitters if receiver_directions is None else receiver_directions
+    return Signature(rotated, sweep, transmitters, received)
 
 
 def aspect_directions(

@@ -1,15 +1,24 @@
 """Simulate exact signals as a real radar records them: scene → paths → beat signal → spectrum."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
 from invertwin.capture.capture import Capture
-from invertwin.channel import Grid, Paths, Sampling, Speckle, draw_speckle, trace_field
+from invertwin.channel import (
+    Grid,
+    Paths,
+    Sampling,
+    Speckle,
+    draw_speckle,
+    trace_field,
+    trace_field_with_mirrors,
+)
 from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
@@ -58,6 +67,7 @@ def simulate(
     snr_db: float | None = None,
     noise_figure_db: float | None = None,
     impairments: Impairments | None = None,
+    mirrors: Collection[str] = (),
 ) -> Simulation:
     """Simulate a capture of a scene: exact signals with noise.
 
@@ -73,9 +83,12 @@ def simulate(
         snr_db: Noise relative to the mean signal power per sample.
         noise_figure_db: Thermal noise of a receiver instead.
         impairments: Impairments of the front end; they have a noise level of their own.
+        mirrors: Names of smooth flat objects, such as a wall, in which the rest is seen a second
+            time (ghosts): paths of up to ``sampling.depth`` surfaces that scatter once.
 
     Raises:
-        InputError: An object in motion: a frame is one instant. Two noise levels.
+        InputError: An object in motion: a frame is one instant. Two noise levels. A mirror that is
+            missing, or smooth nowhere.
     """
     checked_type(scene, Scene, "a scene", "build one with Scene({name: Object(...)})")
     checked_type(radar, Radar, "a radar", "build one with Radar(...), or capture.radar()")
@@ -93,9 +106,8 @@ def simulate(
             "expected the noise level in the impairments, got one beside them; give "
             "Impairments(snr_db=...)"
         )
-    paths = trace_field(
-        scene, radar.link(), sampling=sampling or Sampling(), seed=seed, speckle=speckle
-    )
+    how: Any = {"sampling": sampling or Sampling(), "seed": seed, "speckle": speckle}
+    paths = trace_field_with_mirrors(scene, radar.link(), mirrors, **how)
     if impairments is not None:
         beat = impairments.record(paths, radar, seed=seed)
     else:

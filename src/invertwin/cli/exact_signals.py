@@ -24,17 +24,10 @@ def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simu
     data = require_simulated_data(run)
     refuse_motion(run)
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
+    noise: Any = {} if front else {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
+    how = _settings(run, data, data.depth) | noise
     with torch.no_grad():
-        return simulate(
-            scene,
-            radar,
-            grid,
-            seed=run.seed if data.seed is None else data.seed,
-            sampling=_make_sampling(data, data.depth),
-            snr_db=None if front else data.snr_db,
-            noise_figure_db=None if front else data.noise_figure_db,
-            impairments=front,
-        )
+        return simulate(scene, radar, grid, impairments=front, **how)
 
 
 def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> torch.Tensor:
@@ -42,17 +35,10 @@ def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirp
     data = require_simulated_data(run)
     front = sensors.impairments(run.impairments, data)
     table = require_section(run, "chirps", "several ramps a frame")
+    moving, how = build_moving_scene(run, scene), _settings(run, data, 1)
+    how |= {"retrace": table.retrace, "visibility_every": table.visibility_every}
     with prefix_errors("chirps"), torch.no_grad():
-        return simulate_chirps(
-            build_moving_scene(run, scene),
-            radar,
-            chirps,
-            seed=run.seed if data.seed is None else data.seed,
-            sampling=_make_sampling(data, 1),
-            retrace=table.retrace,
-            visibility_every=table.visibility_every,
-            impairments=front,
-        )
+        return simulate_chirps(moving, radar, chirps, impairments=front, **how)
 
 
 def require_simulated_data(run: RunFile) -> SimulatedData:
@@ -70,7 +56,9 @@ def require_simulated_data(run: RunFile) -> SimulatedData:
     return data
 
 
-def _make_sampling(data: SimulatedData, depth: int) -> Sampling:
+def _settings(run: RunFile, data: SimulatedData, depth: int) -> dict[str, Any]:
+    """Arguments that both kinds of simulation take."""
     rough: Any = {"points_per_m2": data.points_per_m2, "rough_paths": data.rough_paths}
     smooth: Any = {"conductor_samples": data.samples, "boundary_samples": 0, "boundary": False}
-    return Sampling(depth, **smooth, **rough)
+    seed = run.seed if data.seed is None else data.seed
+    return {"seed": seed, "sampling": Sampling(depth, **smooth, **rough)}

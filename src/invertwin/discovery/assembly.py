@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -148,15 +149,10 @@ class ShapeLikelihood:
             steps: number of steps.
         """
         unknowns = self.unknowns(shapes)
-        found = reconstruct(
-            self.build_scene(shapes),
-            Observation(self.model, self.power, sensor=self.radar),
-            unknowns,
-            loss=self.loss,
-            optimizer=Optimizer("adam", rate=_LEARNING_RATE),
-            schedule=Schedule(steps, annealing=0.5),
-            seed=self.seed,
-        )
+        seen = Observation(self.model, self.power, sensor=self.radar)
+        rules: Any = {"optimizer": Optimizer("adam", rate=_LEARNING_RATE), "loss": self.loss}
+        plan: Any = {"schedule": Schedule(steps, annealing=0.5), "seed": self.seed}
+        found = reconstruct(self.build_scene(shapes), seen, unknowns, **rules, **plan)
         return [one.shape for one in unknowns.values()], found
 
 

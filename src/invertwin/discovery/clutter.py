@@ -88,18 +88,11 @@ def reconstruct_among_clutter(
         blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
         clutter = [estimate_clutter(present, o, fitted, seed=seed).background for o in blurred]
         whitened = _whiten([o.model for o in blurred], clutter)
-        found = inversion.reconstruct(
-            scene,
-            [replace(o, model=model) for o, model in zip(given, whitened, strict=True)],
-            unknowns,
-            schedule=[
-                replace(stage, models=_whiten([m.scale_blur(blur) for m in stage.models], clutter))
-                for stage in stages
-            ],
-            seed=seed,
-            callbacks=callbacks(number),
-            **options,
-        )
+        watched = [replace(o, model=model) for o, model in zip(given, whitened, strict=True)]
+        models = [_whiten([m.scale_blur(blur) for m in stage.models], clutter) for stage in stages]
+        schedule = [replace(stage, models=m) for stage, m in zip(stages, models, strict=True)]
+        how: Any = {"schedule": schedule, "seed": seed, "callbacks": callbacks(number), **options}
+        found = inversion.reconstruct(scene, watched, unknowns, **how)
         present, modules = found.scene, list(found.parameters)
         unknowns = {
             name: replace(unknown, module=modules.pop(0)) for name, unknown in unknowns.items()

@@ -12,7 +12,7 @@ derivative without boundary paths.
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -143,18 +143,11 @@ class Cells(ReceiverLocations):
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
             return propagation.path_moments(paths, tx, rx, sensor.mount)
 
-        lit = trace_coverage(
-            scene,
-            sensor.positions,
-            self.surface(),
-            points.flatten(0, 1),
-            propagation.frequency,
-            PathMeasure(measure, 3),
-            depth=propagation.depth,
-            rays=propagation.rays,
-            boundary_samples=self.sampling.edge_points if self.sampling.boundary else 0,
-            seed=seed,
-        )
+        places = sensor.positions, self.surface(), points.flatten(0, 1), propagation.frequency
+        edges = self.sampling.edge_points if self.sampling.boundary else 0
+        how: Any = {"depth": propagation.depth, "rays": propagation.rays, "seed": seed}
+        counted = PathMeasure(measure, 3)
+        lit = trace_coverage(scene, *places, counted, boundary_samples=edges, **how)
         mean = lit.amount.unflatten(1, points.shape[:2]).mean(2)
         for part in lit.boundary_paths:
             cell = self.find_cells(part.point, part.face)

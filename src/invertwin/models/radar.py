@@ -40,6 +40,9 @@ class SurrogateMap(ForwardModel):
             is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
         stretch: Wavelength of the targets' phases at the start of a fit, in wavelengths of the
             radar. Lobes of plates and dihedrals are wider by it, with the same peaks.
+        mirrors: Names of smooth flat objects, such as a wall or a floor, in which everything but
+            the coherent targets is seen a second time (ghosts): paths of up to ``sampling.depth``
+            surfaces that scatter once. A smooth surface that is not named is a lobe.
 
     Raises:
         InputError: An unknown name, or "exact", which is ``ExactMap``; a stretch below 1, or one
@@ -51,6 +54,7 @@ class SurrogateMap(ForwardModel):
     sampling: channel.Sampling = channel.Sampling()
     coherent: Sequence[str] = ()
     stretch: Annotated[float, Ge(1)] = 1.0
+    mirrors: Sequence[str] = ()
     _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
         default=None, repr=False
     )
@@ -61,12 +65,13 @@ class SurrogateMap(ForwardModel):
             raise InputError(
                 'expected a surrogate for a SurrogateMap, got "exact"; use ExactMap(grid)'
             )
-        if isinstance(self.coherent, str):
-            raise InputError(
-                f"expected a list of names of coherent targets, got {self.coherent!r}; give "
-                f"coherent=[{self.coherent!r}]"
-            )
-        set_fields(self, surrogate=chosen, coherent=tuple(self.coherent))
+        for name in ("coherent", "mirrors"):
+            if isinstance(names := getattr(self, name), str):
+                raise InputError(
+                    f"expected a list of names of objects, got {names!r}; give {name}=[{names!r}]"
+                )
+            set_fields(self, **{name: tuple(names)})
+        set_fields(self, surrogate=chosen)
         if not 1 <= self.stretch < math.inf or (self.stretch > 1 and not self.coherent):
             raise InputError(
                 f"expected a stretch >= 1 of coherent targets, got {self.stretch} and "
@@ -88,6 +93,7 @@ class SurrogateMap(ForwardModel):
             reference = (fixed, device.link())
         how: dict[str, Any] = {"sampling": self.sampling, "seed": seed, "scheme": scheme}
         how |= {"reference": reference, "coherent": self.coherent, "stretch": self.stretch}
+        how |= {"mirrors": self.mirrors}
         return surrogates.surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(
@@ -112,9 +118,13 @@ class SurrogateMap(ForwardModel):
                 "scene; use predict, or the model that for_differences was called of"
             )
         rest = [channel.as_absorbers(scene, self.coherent) for scene in scenes]
-        deposit = channel.deposit_batch(
-            rest, sensor.link(), self.grid, sampling=self.sampling, seed=seed
-        )
+        place, drawn = (sensor.link(), self.grid), dict[str, Any](sampling=self.sampling, seed=seed)
+        bare = [channel.without_specular(scene, self.mirrors) for scene in rest]
+        deposit = channel.deposit_batch(bare, *place, **drawn)
+        if self.mirrors:
+            ghosts = *place, self.mirrors
+            images = [channel.deposit_mirrored_power(scene, *ghosts, **drawn) for scene in rest]
+            deposit = deposit + torch.stack(images)
         if self.coherent:
             how = sensor, self.grid, self.kernels, self.sampling, self.coherent, self.stretch
             targets = [
@@ -140,13 +150,15 @@ class SurrogateMap(ForwardModel):
 
         None for clouds and for smooth conductors that are no targets.
         """
-        rest = channel.as_absorbers(scene, self.coherent)
+        whole = channel.as_absorbers(scene, self.coherent)
+        rest = channel.without_specular(whole, self.mirrors)
         if not isinstance(sensor.waveform, SampledWaveform) or any(
             item.cloud is not None or item.material.coherent for item in rest.objects.values()
         ):
             return None
         fields, link = replace(self.sampling, boundary=False), sensor.link()
-        paths = channel.trace_field(rest, link, sampling=fields, seed=seed)
+        how = link, self.mirrors
+        paths = channel.trace_field_with_mirrors(whole, *how, sampling=fields, seed=seed)
         looks = SpeckleRealisations(paths, sensor)
         targets = [
             beat_signal(channel.trace_target(scene, name, link, sampling=fields), sensor)

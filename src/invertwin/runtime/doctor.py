@@ -459,17 +459,10 @@ def _run(
     code: str, environment: dict[str, str], folder: str | None, *arguments: str, timeout: float
 ) -> subprocess.CompletedProcess[str]:
     # -P: a file in the current folder must not stand in for a module.
-    return subprocess.run(
-        [sys.executable, "-P", "-c", code, *arguments],
-        env=environment,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=timeout,
-        stdin=subprocess.DEVNULL,
-        check=False,
-    )
+    command = [sys.executable, "-P", "-c", code, *arguments]
+    streams: Any = {"capture_output": True, "text": True, "errors": "replace"}
+    place: Any = {"env": environment, "cwd": folder, "stdin": subprocess.DEVNULL}
+    return subprocess.run(command, timeout=timeout, check=False, **streams, **place)
 
 
 @functools.cache

@@ -226,15 +226,9 @@ def _antenna_silhouette_paths(
         return walker.run(state, depth, visit_connection)
 
     for number, (sign, passed) in enumerate(samples.sides(fixed)):
-        state = walk.initial_state(
-            samples.index,
-            frame,
-            shadow,
-            incident,
-            throughput=throughput * passed.transmittance * sign,
-            length=distance + passed.extra_length,
-            transmission=passed if fixed.surfaces.has_sheets else None,
-        )
+        power, length = throughput * passed.transmittance * sign, distance + passed.extra_length
+        begin = samples.index, frame, shadow, incident, power, length
+        state = walk.initial_state(*begin, passed if fixed.surfaces.has_sheets else None)
         if not isinstance(at_receiver, bool):
             state = walk.update_state(state, u=departure.y, v=departure.z, to_receiver=~at_receiver)
         # Anew for each side: a derivative consumes the graph of the velocity.
@@ -277,14 +271,10 @@ def _interior_silhouette_paths(
         return walker.run(state, choices + 1 - count, visit_connection)
 
     for number, (sign, passed) in enumerate(samples.sides(fixed)):
-        state = walk.initial_state(
-            samples.index + _SECOND_PART_OFFSET,
-            samples.frame,
-            shadow,
-            to_behind,
-            throughput=done["power"] * passed.transmittance * sign,
-            length=done["optical_length"] + distance + passed.extra_length,
-        )
+        power = done["power"] * passed.transmittance * sign
+        length = done["optical_length"] + distance + passed.extra_length
+        begin = samples.index + _SECOND_PART_OFFSET, samples.frame, shadow, to_behind
+        state = walk.initial_state(*begin, power, length)
         state = walk.update_state(
             state, u=done["u"], v=done["v"], to_receiver=~ends_at_receiver, previous_vertices=count
         )

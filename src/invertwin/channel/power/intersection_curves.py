@@ -301,15 +301,11 @@ class _CoveredSide:
         """Create the state of the paths at the curve, for unit velocity."""
         before, points = self.subpath, self.subpath.points
         passed = self.transmit(before.incident)
-        state = walk.initial_state(
-            points.index + _SUBPATH_OFFSET,
-            points.frame,
-            (points.first, points.second)[self.own],
-            before.incident,
-            throughput=before.throughput * passed.transmittance * self.sign,
-            length=before.length + passed.extra_length,
-            transmission=points.transmission if before.shared else None,
-        )
+        place = points.frame, (points.first, points.second)[self.own], before.incident
+        throughput = before.throughput * passed.transmittance * self.sign
+        begin = points.index + _SUBPATH_OFFSET, *place, throughput
+        length, shared = before.length + passed.extra_length, before.shared
+        state = walk.initial_state(*begin, length, points.transmission if shared else None)
         return walk.update_state(state, **before.keys)
 
     def speed(self, inputs: Inputs) -> mit.Float:

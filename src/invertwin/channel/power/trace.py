@@ -173,15 +173,12 @@ class PowerTracer:
         departure = integrand.to_radar_frame(self.fixed, start.frame, -incident)
         gain = self.fixed.gain(start.frame, False, departure)
         weight = start.weight * passed.transmittance * self.fixed.scale * gain / dr.square(distance)
-        return walk.initial_state(
-            index,
-            start.frame,
-            start.point,
-            incident,
-            throughput=dr.select(start.weight > 0, weight, 0.0),
-            length=distance + passed.extra_length,
-            transmission=passed if self.fixed.surfaces.has_sheets else None,
+        throughput, length = (
+            dr.select(start.weight > 0, weight, 0.0),
+            distance + passed.extra_length,
         )
+        begin = index, start.frame, start.point, incident, throughput, length
+        return walk.initial_state(*begin, passed if self.fixed.surfaces.has_sheets else None)
 
     @cached_property
     def boundary_samples(self) -> BoundarySamples | None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -61,15 +62,9 @@ def merge_into_prism(shapes: primitives.Shapes, level: float, spacing: float) ->
         parts.append(signed_distance(mesh, nodes))
     largest = max(shapes, key=lambda one: one.length * one.width)
     x, y = middle.tolist()
-    return PrismParameters(
-        "prism",
-        (x, y),
-        height=largest.height,
-        brightness=largest.brightness,
-        distances=torch.stack(parts).amin(0).reshape(counts),
-        spacing=step,
-        middle=(x, y),
-    )
+    shape: dict[str, Any] = {"height": largest.height, "brightness": largest.brightness}
+    shape |= {"distances": torch.stack(parts).amin(0).reshape(counts), "spacing": step}
+    return PrismParameters("prism", (x, y), middle=(x, y), **shape)
 
 
 class OutlineModel(primitives.UnknownShape):

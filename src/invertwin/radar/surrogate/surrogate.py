@@ -255,12 +255,13 @@ def surrogate_spectrum(
     reference: tuple[Scene, channel.Link] | None = None,
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
+    mirrors: Sequence[str] = (),
 ) -> _Maps:
     """Compute the power spectrum of a scene, differentiable: deposit, then shape.
 
     Negative bins after shaping are set to zero. Coherent targets are deposited in addition to the
     rough power: all bounces of one target in one cell add coherently, and targets add in power. For
-    the rest of the scene they only cast shadows.
+    the rest of the scene they only cast shadows, and mirrors show no images of them.
 
     Args:
         scene: scene to simulate.
@@ -272,9 +273,10 @@ def surrogate_spectrum(
         scheme, reference: See ``deposit_power``.
         coherent: names of coherent targets, see ``trace_target``.
         stretch: wavelength of their phases in wavelengths of the radar.
+        mirrors: names of smooth flat objects, see ``deposit_mirrored_power``.
 
     Raises:
-        InputError: See ``deposit_power`` and ``trace_target``.
+        InputError: See ``deposit_power``, ``deposit_mirrored_power`` and ``trace_target``.
     """
     link = radar.link()
     parts = deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
@@ -282,8 +284,12 @@ def surrogate_spectrum(
         if reference is not None:
             reference = channel.as_absorbers(reference[0], coherent), reference[1]
         rest = channel.as_absorbers(scene, coherent)
-        how: Any = {"seed": seed, "scheme": scheme, "reference": reference}
-        parts.append(channel.deposit_power(rest, link, grid, sampling=sampling, **how))
+        drawn: Any = {"sampling": sampling, "seed": seed}
+        how: Any = {"scheme": scheme, "reference": reference, **drawn}
+        bare = channel.without_specular(rest, mirrors)
+        parts.append(channel.deposit_power(bare, link, grid, **how))
+        if mirrors:
+            parts.append(channel.deposit_mirrored_power(rest, link, grid, mirrors, **drawn))
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
 
 

@@ -414,14 +414,9 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
         poses = torch.einsum(
             "ab,cd,ef,vbjdf->vajce", turn, turn, turn, poses.unflatten(2, (-1, 3, 3))
         ).flatten(2)
-    return BodyTemplate(
-        rest,
-        torch.from_numpy(arrays["f"].astype(np.int64)),
-        checked_tensor(arrays["weights"], (len(rest), count), "weights", _DO),
-        # The parent of the root is arbitrary, 2³² − 1 in most files.
-        (-1, *(int(parent) for parent in table[0, 1:])),
-        regressor @ rest,
-        directions,
-        torch.einsum("jv,van->jan", regressor, directions),
-        poses,
-    )
+    faces = torch.from_numpy(arrays["f"].astype(np.int64))
+    weights = checked_tensor(arrays["weights"], (len(rest), count), "weights", _DO)
+    # The parent of the root is arbitrary, 2³² − 1 in most files.
+    skeleton = (-1, *(int(parent) for parent in table[0, 1:])), regressor @ rest
+    moved = directions, torch.einsum("jv,van->jan", regressor, directions), poses
+    return BodyTemplate(rest, faces, weights, *skeleton, *moved)

@@ -135,16 +135,10 @@ def load_anny(
         bones.append((heads_up - heads_down) / (2 * _STEP))
     share = torch.zeros(len(rest), len(model.bone_labels), dtype=torch.float64)
     share.scatter_add_(1, model.vertex_bone_indices.long(), model.vertex_bone_weights.double())
-    return BodyTemplate(
-        rest,
-        model.get_triangular_faces().long(),
-        share,
-        (-1, *(int(parent) for parent in model.bone_parents[1:])),
-        places,
-        torch.stack(skin, dim=-1) if skin else None,
-        torch.stack(bones, dim=-1) if bones else None,
-        names=tuple(model.bone_labels),
-    )
+    parents = (-1, *(int(parent) for parent in model.bone_parents[1:]))
+    own = rest, model.get_triangular_faces().long(), share, parents, places
+    moves = [torch.stack(columns, dim=-1) if columns else None for columns in (skin, bones)]
+    return BodyTemplate(*own, *moves, names=tuple(model.bone_labels))
 
 
 def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
