@@ -9,16 +9,9 @@ import torch
 from jaxtyping import Complex128, Float
 from torch import Tensor
 
+from invertwin import channel
 from invertwin.capture.capture import Capture
-from invertwin.channel import (
-    Grid,
-    Paths,
-    Sampling,
-    Speckle,
-    draw_speckle,
-    trace_field,
-    trace_field_with_mirrors,
-)
+from invertwin.channel import Grid, Paths, Sampling, Speckle
 from invertwin.checks import checked_count, checked_type
 from invertwin.errors import InputError
 from invertwin.radar.processing.beamforming import exact_spectrum
@@ -29,6 +22,9 @@ from invertwin.radar.signal.keyframes import VisibilityKeyframes, vertex_displac
 from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_paths
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene.scene import Scene, warn_if_purely_specular
+
+MIRRORED_DEPTH = 3
+"""Most surfaces on a path by mirrors: from a mirror to a target, and back by it."""
 
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
 _STRAIGHT_TOLERANCE = 1e-6
@@ -107,7 +103,7 @@ def simulate(
             "Impairments(snr_db=...)"
         )
     how: Any = {"sampling": sampling or Sampling(), "seed": seed, "speckle": speckle}
-    paths = trace_field_with_mirrors(scene, radar.link(), mirrors, **how)
+    paths = channel.trace_field_with_mirrors(scene, radar.link(), mirrors, **how)
     if impairments is not None:
         beat = impairments.record(paths, radar, seed=seed)
     else:
@@ -128,6 +124,7 @@ def simulate_chirps(
     visibility_every: int = 1,
     speckle: Speckle | None = None,
     impairments: Impairments | None = None,
+    mirrors: Collection[str] = (),
 ) -> Complex128[Tensor, "frame chirp tx rx sample"]:
     """Beat signals of a moving scene, chirp by chirp; the radar rests within a frame.
 
@@ -144,7 +141,8 @@ def simulate_chirps(
         radar: Arrays, waveform and poses.
         chirps: Timing of the ramps.
         seed: Places and phases; those of rough points belong to the surface and move with it.
-        sampling: How paths are sampled, of one bounce; None = ``Sampling(depth=1)``.
+        sampling: How paths are sampled, of one bounce; None = ``Sampling(depth=1)``, and 3 with
+            mirrors.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
             points seen at the start of the frame. A function of time always does, but see the next.
         visibility_every: Loops for which visibility and amplitudes of a function of time are kept;
@@ -152,6 +150,8 @@ def simulate_chirps(
             their surface at every ramp, and what stands still is summed once. Without derivatives.
         speckle: Rough points to use again.
         impairments: Impairments of the front end; phase noise only without retracing.
+        mirrors: Names of smooth flat objects at rest, as of ``simulate``. Paths by them meet up to
+            ``sampling.depth`` surfaces; not with motion that is traced at every ramp.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
@@ -166,16 +166,25 @@ def simulate_chirps(
     if again and impairments is not None:
         impairments.check_applicable()
     motion = scene.advance if isinstance(scene, Scene) else scene
-    plan = sampling or Sampling(depth=1)
+    plan = sampling or Sampling(depth=MIRRORED_DEPTH if mirrors else 1)
+    if mirrors and again:
+        raise InputError(
+            f"expected uniform velocities with mirrors, got {len(mirrors)} mirrors and motion that "
+            "is traced at every ramp; give a Scene with velocities and retrace=False"
+        )
     if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
         raise InputError(
             f"expected visibility_every 1 with {plan.depth} bounces and retrace={retrace}, got "
             f"{visibility_every}; it is for paths of one bounce of a function of time"
         )
-    fixed = speckle or draw_speckle(motion(0.0), radar.link(), plan, seed)
+    # One trace draws its own points; those of several are the same.
+    fixed = speckle
+    if not (speckle or mirrors):
+        fixed = channel.draw_speckle(motion(0.0), radar.link(), plan, seed)
 
     def trace_instant(instant: Scene) -> Paths:
-        return trace_field(instant, radar.link(), sampling=plan, seed=seed, speckle=fixed)
+        how: Any = {"sampling": plan, "seed": seed, "speckle": fixed}
+        return channel.trace_field_with_mirrors(instant, radar.link(), mirrors, **how)
 
     if isinstance(scene, Scene) and not again:
         front = impairments or Impairments()

@@ -14,6 +14,7 @@ from invertwin.channel.coverage.coverage import PathMeasure as PathMeasure
 from invertwin.channel.coverage.coverage import trace_coverage as trace_coverage
 from invertwin.channel.coverage.mirrors import deposit_mirrored_power as deposit_mirrored_power
 from invertwin.channel.coverage.mirrors import trace_field_with_mirrors as trace_field_with_mirrors
+from invertwin.channel.coverage.mirrors import trace_mirrored_power as trace_mirrored_power
 from invertwin.channel.coverage.single_scattering import scattered_power as scattered_power
 from invertwin.channel.coverage.single_scattering import (
     trace_single_scattering as trace_single_scattering,

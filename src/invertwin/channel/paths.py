@@ -143,7 +143,8 @@ class Paths(Rows):
         kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
         boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
             shadow edge (derivations §3).
-        velocity: World velocity of the scattering point [m/s]; None = at rest.
+        velocity: World velocity of the last point [m/s]; None = at rest.
+        first_velocity: That of the first one, where a mirror shows another; None = the same.
         matrix: Field coefficients between the polarisations that the elements of the arrays mix,
             receive × transmit; None where all elements are alike. ``coefficient`` is that of the
             mean elements.
@@ -162,6 +163,7 @@ class Paths(Rows):
     kind: str
     boundary: Bool[Tensor, " path"]
     velocity: Float64[Tensor, "path 3"] | None = None
+    first_velocity: Float64[Tensor, "path 3"] | None = None
     matrix: Complex128[Tensor, "path r t"] | None = None
     face: Int64[Tensor, " path"] | None = None
     barycentric: Float64[Tensor, "path 2"] | None = None
@@ -229,10 +231,9 @@ def concatenate_paths(parts: Sequence[Paths]) -> Paths:
     joined: dict[str, Any] = {}
     for field in fields(Paths):
         columns = [getattr(part, field.name) for part in parts]
-        if field.name == "velocity" and any(column is not None for column in columns):
-            columns = [
-                torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts
-            ]
+        if "velocity" in field.name and any(column is not None for column in columns):
+            own = [torch.zeros_like(p.last) if p.velocity is None else p.velocity for p in parts]
+            columns = [v if c is None else c for c, v in zip(columns, own, strict=True)]
         if field.name != "kind":
             joined[field.name] = None if any(c is None for c in columns) else torch.cat(columns)
     kinds = {part.kind for part in parts}

@@ -1,15 +1,17 @@
 """Forward model of chirp trains: power over range, Doppler and direction."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from invertwin import channel
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.channel import Grid, Paths, Sampling, trace_power
+from invertwin.channel import Grid, Paths, Sampling
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
@@ -20,7 +22,7 @@ from invertwin.radar.surrogate.range_doppler import range_doppler_power
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
-from invertwin.simulation import simulate_chirps
+from invertwin.simulation import MIRRORED_DEPTH, simulate_chirps
 
 _LOOK_POINTS = 300  # of the largest moving surface
 _Maps = Float[Tensor, "frame velocity range u v"]  # power of every frame
@@ -40,6 +42,8 @@ class RangeDopplerMap(ForwardModel):
         rates: Range rates to show, positive moves away [m/s]; some of those of ``bins``.
         bins: Bins of range rate over the whole unambiguous span.
         sampling: How paths are sampled; one bounce, fixed visibility.
+        mirrors: Names of smooth flat objects at rest, in which what moves is seen a second time
+            (ghosts): paths of up to three surfaces.
     """
 
     grid: Grid
@@ -47,6 +51,7 @@ class RangeDopplerMap(ForwardModel):
     rates: Float64[Tensor, " velocity"]
     bins: int
     sampling: Sampling = Sampling(depth=1, boundary=False)
+    mirrors: Sequence[str] = ()
 
     # Each takes seconds; 16 determine a standard deviation to 18 %.
     realisation_count: ClassVar[int] = 16
@@ -91,7 +96,11 @@ class RangeDopplerMap(ForwardModel):
                 "expected an object with a velocity for a MotionMap, got none; give one a "
                 "velocity, or fit a MovingBody"
             )
-        paths = trace_power(scene, sensor.link(), sampling=self.sampling, seed=seed)
+        link, rest = sensor.link(), channel.without_specular(scene, self.mirrors)
+        paths = channel.trace_power(rest, link, sampling=self.sampling, seed=seed)
+        if self.mirrors:
+            how: Any = {"sampling": replace(self.sampling, depth=MIRRORED_DEPTH), "seed": seed}
+            paths += channel.trace_mirrored_power(scene, link, self.mirrors, **how)
         assert paths.velocity is not None
         return self.predict_paths(paths.select((paths.velocity.detach() != 0).any(1)), sensor)
 
@@ -131,7 +140,8 @@ class RangeDopplerMap(ForwardModel):
         }
         begun = Scene({**still, **moving})
         area = max(item.mesh.area for item in moving.values())
-        drawn = Sampling(depth=1, boundary=False, points_per_m2=_LOOK_POINTS / area)
+        depth = MIRRORED_DEPTH if self.mirrors else 1
+        drawn = Sampling(depth, boundary=False, points_per_m2=_LOOK_POINTS / area)
         assert isinstance(sensor.waveform, SampledWaveform)
         channels = (*sensor.shape[1:], sensor.waveform.samples)
         shape = (sensor.frame_count, self.chirps.count, *channels)
@@ -141,7 +151,8 @@ class RangeDopplerMap(ForwardModel):
 
         def simulate_beat(number: int) -> Tensor:
             own = derive_seed(number, 0)
-            return simulate_chirps(begun, sensor, self.chirps, seed=own, sampling=drawn)
+            how = begun, sensor, self.chirps
+            return simulate_chirps(*how, seed=own, sampling=drawn, mirrors=self.mirrors)
 
         return noisy_realisations(simulate_beat, to_map, shape, seed, dtype=torch.complex128)
 

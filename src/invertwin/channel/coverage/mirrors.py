@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Literal
 
 import torch
 from jaxtyping import Float32, Float64, Int64
@@ -25,14 +26,14 @@ from invertwin.channel.coherent.speckle import Speckle, draw_speckle
 from invertwin.channel.coverage import single_scattering
 from invertwin.channel.em import antenna_fields
 from invertwin.channel.em.depolarisation import random_scattering_matrix
-from invertwin.channel.em.plane_waves import dot
+from invertwin.channel.em.plane_waves import dot, reflect_vectors, triangle_normals
 from invertwin.channel.paths import Grid, Link, Paths, concatenate_paths
 from invertwin.channel.power.bins import deposit_paths
 from invertwin.channel.rays import ray_scene, scene_tables
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.sampling import Sampling
 from invertwin.channel.specular import image_method, point_targets, trace_paths
-from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
+from invertwin.channel.specular.ray_paths import REFLECTION, RayPaths, join_ray_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.runtime.concurrency import torch_threads
@@ -72,7 +73,7 @@ def deposit_mirrored_power(
             motion; derivatives where a moving surface touches one that scatters.
     """
     with tracing(sampling.backend), torch_threads(1):
-        search = _MirrorSearch(scene, link, mirrors, sampling, seed)
+        search = _MirrorSearch(scene, link, mirrors, sampling, seed, "refused")
 
         def deposit(pairs: _Pairs) -> Tensor:
             return deposit_paths(search.pair_powers(pairs), link, grid)
@@ -95,27 +96,32 @@ def trace_field_with_mirrors(
     """Trace field paths as ``trace_field``, and those by mirrors.
 
     Conductors scatter by physical optics, rough surfaces by their fixed points with the phases that
-    they have in direct echoes.
+    they have in direct echoes. A path by mirrors has the velocity of its point, mirrored where an
+    antenna sees the image.
 
     Args:
         scene: scene with surfaces.
         link: antennas, per frame.
         mirrors: names of the smooth flat objects that reflect; without any, ``trace_field``.
-        sampling: numbers of points; ``depth`` is the maximum number of surfaces on a path.
+        sampling: numbers of points; ``depth`` is the maximum number of surfaces on a path. Where
+            objects move, other paths than those by mirrors have one bounce.
         seed: random seed of the points.
         speckle: rough points; None draws them.
 
     Raises:
-        InputError: mirrors that the scene lacks, or that reflect no coherent wave; objects in
-            motion; derivatives with respect to geometry with ``boundary``, which single points
-            lack; and errors of ``trace_field``.
+        InputError: mirrors that the scene lacks, that reflect no coherent wave, or that move;
+            derivatives with respect to geometry with ``boundary``, which single points lack; and
+            errors of ``trace_field``.
     """
-    rest = single_scattering.without_specular(scene, mirrors)
-    direct = trace_field(rest, link, sampling=sampling, seed=seed, speckle=speckle)
     if not mirrors:
-        return direct
+        return trace_field(scene, link, sampling=sampling, seed=seed, speckle=speckle)
+    rest = single_scattering.without_specular(scene, mirrors)
+    moves = any(item.velocity is not None for item in scene.objects.values())
+    own = replace(sampling, depth=1) if moves else sampling
+    fixed = speckle or draw_speckle(rest, link, own, seed)
+    direct = trace_field(rest, link, sampling=own, seed=seed, speckle=fixed)
     with tracing(sampling.backend), torch_threads(1):
-        search = _MirrorSearch(scene, link, mirrors, sampling, seed)
+        search = _MirrorSearch(scene, link, mirrors, sampling, seed, "fixed")
         geometry, frames = search.geometry, range(link.frame_count)
         if sampling.boundary and scene_tables.is_visibility_differentiated(geometry, link):
             raise InputError(
@@ -130,9 +136,32 @@ def trace_field_with_mirrors(
             found += search.trace_points(points, frames, search.conductor_fields)
         rough = search.tracer.is_scattering & ~smooth
         if bool(rough.any()):
-            fixed = (speckle or draw_speckle(rest, link, sampling, seed)).points
-            own = fixed.select(rough[fixed.face[:, 0]])
-            found += search.trace_points(own, frames, search.rough_fields)
+            points = fixed.points.select(rough[fixed.points.face[:, 0]])
+            found += search.trace_points(points, frames, search.rough_fields)
+    return concatenate_paths(found)
+
+
+def trace_mirrored_power(
+    scene: Scene, link: Link, mirrors: Collection[str], *, sampling: Sampling, seed: int
+) -> Paths:
+    """Trace the power paths that ``deposit_mirrored_power`` sums, as explicit rows.
+
+    Visibility is fixed. Objects may move: a path has the velocity of its point, mirrored where an
+    antenna sees the image.
+
+    Args:
+        scene, link, mirrors, seed: as of ``deposit_mirrored_power``.
+        sampling: number of points, and ``depth``.
+
+    Raises:
+        InputError: see ``deposit_mirrored_power``; mirrors that move.
+    """
+    with tracing(sampling.backend), torch_threads(1):
+        search = _MirrorSearch(scene, link, mirrors, sampling, seed, "free")
+        points, found = search.tracer.sample_points(search.geometry), search.trace_flash()
+        for frame in range(link.frame_count):
+            own = points.points.select(points.antenna == frame)
+            found += search.trace_points(own, [frame], search.pair_powers)
     return concatenate_paths(found)
 
 
@@ -140,7 +169,13 @@ class _MirrorSearch:
     """Search for legs between the antennas of each frame and surfaces, by the mirrors alone."""
 
     def __init__(
-        self, scene: Scene, link: Link, mirrors: Collection[str], sampling: Sampling, seed: int
+        self,
+        scene: Scene,
+        link: Link,
+        mirrors: Collection[str],
+        sampling: Sampling,
+        seed: int,
+        motion: Literal["refused", "fixed", "free"],
     ) -> None:
         frequency = SPEED_OF_LIGHT / link.wavelength
         for name in mirrors:
@@ -151,12 +186,18 @@ class _MirrorSearch:
                     "power is scattered; give it a Slab, a PerfectConductor, or "
                     "Dielectric(scattering=0)"
                 )
+            if scene[name].velocity is not None:
+                raise InputError(
+                    f"expected mirrors at rest, got a velocity on {name!r}; remove one of them"
+                )
         rest = single_scattering.without_specular(scene, mirrors)
-        self.link, self.geometry = link, scene_tables.flatten(rest, link.wavelength)
+        self.link = link
+        self.geometry = scene_tables.flatten(rest, link.wavelength, motion=motion)
         flat = scene
         for name in set(scene.names) - set(mirrors):
             flat = flat.replace(name, material=_NonReflecting(scene[name].material))
-        self.stage = trace_paths.prepare_path_scene(flat, link.tx, link.rx, frequency)
+        stage = trace_paths.prepare_path_scene(flat, link.tx, link.rx, frequency)
+        self.stage = replace(stage, velocities=None)
         active = trace_paths.face_interactions(self.stage)
         few = int((active.reflect | active.transmit).sum()) <= _FEW_TRIANGLES
         drawn = replace(sampling, samples=max(1, sampling.samples // _RAYS_PER_POINT))
@@ -198,8 +239,24 @@ class _MirrorSearch:
             how = self.stage, self.geometry, legs, place, area
             pairs, index = self.tracer.evaluate_pairs(*how)
             paths = evaluate(pairs, place.select(index), some.select(index))
+            moves = some.select(index).velocity(self.geometry)
+            if moves is not None:
+                paths = replace(
+                    paths,
+                    velocity=self._image_velocity(pairs.inbound, moves),
+                    first_velocity=self._image_velocity(pairs.outbound, moves),
+                )
             found.append(paths.select(paths.has_field | (paths.power > 0)))
         return found
+
+    def _image_velocity(self, legs: RayPaths, velocity: Tensor) -> Tensor:
+        """Velocities of the images of moving points, as the antenna of each leg sees them."""
+        stage = self.stage
+        normal = triangle_normals(stage.vertices.detach()[stage.topology.faces[legs.faces]])
+        for step in reversed(range(legs.faces.shape[1])):
+            mirrored = reflect_vectors(velocity, normal[:, step])
+            velocity = torch.where(legs.kinds[:, step, None] == REFLECTION, mirrored, velocity)
+        return velocity
 
     def pair_powers(self, pairs: _Pairs, *_: _Places | _Points) -> Paths:
         """Paths with the powers of pairs of legs, of the mean elements of both antennas."""

@@ -145,7 +145,7 @@ def moving_beat(
     if trajectory is None and paths.velocity is None:
         beat = beat_signal(paths, radar, tolerance=tolerance)
         return beat[:, None].repeat(1, chirps.count, 1, 1, 1)
-    if not torch.equal(paths.first, paths.last):
+    if paths.first_velocity is None and not torch.equal(paths.first, paths.last):
         raise InputError(
             "expected paths of one bounce, got paths whose first and last points differ; "
             "simulate their motion chirp by chirp with simulate_chirps(retrace=True)"
@@ -182,17 +182,18 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
     It is positive for receding points; the Doppler frequency is 2/λ times it.
 
     Args:
-        paths: paths of one bounce; the rate is zero for paths without velocity.
+        paths: paths of one bounce, or by mirrors; the rate is zero for paths without velocity.
         radar: static radar.
     """
     if paths.velocity is None:
         return torch.zeros_like(paths.delay)
     link, velocity = radar.link(), paths.velocity
+    first_velocity = velocity if paths.first_velocity is None else paths.first_velocity
     tx, rx = (centre.to(paths.first.device)[paths.frame] for centre in (link.tx, link.rx))
 
     def half_length(time: Tensor) -> Tensor:
-        point = paths.last + velocity * time
-        return 0.5 * ((point - tx).norm(dim=1) + (point - rx).norm(dim=1))
+        first, last = paths.first + first_velocity * time, paths.last + velocity * time
+        return 0.5 * ((first - tx).norm(dim=1) + (last - rx).norm(dim=1))
 
     now = torch.zeros((), dtype=torch.float64, device=velocity.device)
     with tracer_lock:
@@ -211,7 +212,8 @@ class ChirpTrain:
     Attributes:
         paths: paths with frames, coefficients, and delays at their first points.
         radar: radar with samples.
-        trajectory: positions of the first points at a time; the last ones move with them.
+        trajectory: positions of the first points at a time; the last ones move with them, but for
+            the difference of both velocities that mirrors make.
         tolerance: relative error of the sums.
     """
 
@@ -235,20 +237,22 @@ class ChirpTrain:
         segments = _segment_length(paths.first, span, *ends)
         origins = self.radar.origin_delays.to(device)[paths.frame]
         inner = paths.delay - origins - segments / SPEED_OF_LIGHT
-        placed = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
+        placed, spans = self._points_at_instants(start, 1 if sample_interval(waveform) == 0 else 3)
         if len(placed) > 1 and len(paths):
-            length = _segment_length(placed, span, *ends)
+            length = _segment_length(placed, spans, *ends)
             cycles = nufft.phase_cycles((length / SPEED_OF_LIGHT).detach(), waveform)
             bend = math.pi * float((cycles[0] - 2 * cycles[1] + cycles[2]).abs().max())
             count = _count_instants(bend)
-            placed = placed if count == 3 else self._points_at_instants(start, count)
+            if count > 3:
+                placed, spans = self._points_at_instants(start, count)
         transmitters, receivers = (places.to(device) for places in self.radar.elements())
         signals: list[list[Tensor]] = [[] for _ in active_transmitters]
         for frame in range(self.radar.frame_count):
             rows = torch.nonzero(paths.frame == frame)[:, 0]
             points = self._scattering_points(placed[:, rows], centers[1][frame])
             own, rest = paths.select(rows), inner[rows]
-            back = [(points + span[rows] - place).norm(dim=-1) for place in receivers[frame]]
+            last = points + spans[:, rows]
+            back = [(last - place).norm(dim=-1) for place in receivers[frame]]
             for tx, found in zip(active_transmitters, signals, strict=True):
                 forth = (points - transmitters[frame, tx]).norm(dim=-1)
                 channels = []
@@ -259,12 +263,17 @@ class ChirpTrain:
                 found.append(torch.stack(channels))
         return torch.stack([torch.stack(found) for found in signals], dim=1)
 
-    def _points_at_instants(self, start: float, count: int) -> Float64[Tensor, "instant path 3"]:
-        """Return the points at the instants of a ramp."""
-        waveform = require_sampled_waveform(self.radar)
+    def _points_at_instants(self, start: float, count: int) -> tuple[Tensor, Tensor]:
+        """Return the first points at the instants of a ramp, and the way on to the last ones."""
+        paths, waveform = self.paths, require_sampled_waveform(self.radar)
         interval = sample_interval(waveform)
         instants = nufft.ramp_instants(waveform.samples, count) if interval else torch.zeros(1)
-        return torch.stack([self.trajectory(start + interval * n) for n in instants.tolist()])
+        times = start + interval * instants.double()
+        span = (paths.last - paths.first).expand(len(times), -1, 3)
+        if paths.first_velocity is not None and paths.velocity is not None:
+            drift = paths.velocity - paths.first_velocity
+            span = span + times.to(drift)[:, None, None] * drift
+        return torch.stack([self.trajectory(time) for time in times.tolist()]), span
 
     def _scattering_points(
         self, points: Float64[Tensor, "instant path 3"], receiver: Float64[Tensor, "3"]
@@ -279,7 +288,7 @@ class ChirpTrain:
 
 
 def _uniform_trajectory(paths: Paths) -> PointTrajectory:
-    velocity = paths.velocity
+    velocity = paths.velocity if paths.first_velocity is None else paths.first_velocity
     assert velocity is not None
     return lambda time: paths.first + velocity * time
 

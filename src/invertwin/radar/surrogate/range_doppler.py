@@ -40,8 +40,9 @@ def range_doppler_power(
     Source: derivations §5 and §6.
 
     Args:
-        paths: one-bounce power paths, with the points at the middle of the frame's chirps.
-        velocities: velocities of their points in the world [m/s].
+        paths: power paths of one bounce, or by mirrors, with the points at the middle of the
+            frame's chirps.
+        velocities: velocities of their last points in the world [m/s].
         radar: radar that records.
         grid: ranges and directions.
         chirps: chirp timing.
@@ -87,7 +88,8 @@ def _directions_and_rates(paths: Paths, velocities: Tensor, radar: Radar) -> tup
     center = 0.5 * (link.tx + link.rx)[paths.frame]
     direction = torch.nn.functional.normalize(paths.last - center, dim=1)
     local = torch.einsum("pji,pj->pi", link.rotations[paths.frame], direction)
-    return local, 0.5 * (velocities * (away_tx + away_rx)).sum(1)
+    first = velocities if paths.first_velocity is None else paths.first_velocity
+    return local, 0.5 * (first * away_tx + velocities * away_rx).sum(1)
 
 
 def _range_doppler_coupling(waveform: Waveform) -> float:
