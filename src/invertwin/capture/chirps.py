@@ -315,13 +315,11 @@ def make_settings(
     others.setdefault("loops", 1)
     rate = waveform.samples / waveform.duration
     nearest = round(rate)
+    others |= {"transmit_order": tuple(senders), "receivers": tuple(listeners)}
+    others |= {"samples": waveform.samples, "adc_start_time": adc_start_time}
     return ChirpSettings(
         start_frequency=waveform.start_frequency - waveform.slope * adc_start_time,
         slope=waveform.slope,
         sample_rate=float(nearest) if math.isclose(rate, nearest, rel_tol=1e-12) else rate,
-        samples=waveform.samples,
-        transmit_order=tuple(senders),
-        receivers=tuple(listeners),
-        adc_start_time=adc_start_time,
         **others,
     )

@@ -25,7 +25,7 @@ def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simu
     refuse_motion(run)
     front = None if run.impairments is None else sensors.impairments(run.impairments, data)
     noise: Any = {} if front else {"snr_db": data.snr_db, "noise_figure_db": data.noise_figure_db}
-    how = _settings(run, data, data.depth) | noise
+    how = _settings(run, scene, data.depth) | noise
     with torch.no_grad():
         return simulate(scene, radar, grid, impairments=front, **how)
 
@@ -35,7 +35,8 @@ def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirp
     data = require_simulated_data(run)
     front = sensors.impairments(run.impairments, data)
     table = require_section(run, "chirps", "several ramps a frame")
-    moving, how = build_moving_scene(run, scene), _settings(run, data, 1)
+    depth = data.depth if data.mirrors else 1
+    moving, how = build_moving_scene(run, scene), _settings(run, scene, depth)
     how |= {"retrace": table.retrace, "visibility_every": table.visibility_every}
     with prefix_errors("chirps"), torch.no_grad():
         return simulate_chirps(moving, radar, chirps, impairments=front, **how)
@@ -56,9 +57,12 @@ def require_simulated_data(run: RunFile) -> SimulatedData:
     return data
 
 
-def _settings(run: RunFile, data: SimulatedData, depth: int) -> dict[str, Any]:
+def _settings(run: RunFile, scene: Scene, depth: int) -> dict[str, Any]:
     """Arguments that both kinds of simulation take."""
+    data = require_simulated_data(run)
+    with prefix_errors("data.mirrors"):
+        mirrors = [name for name in data.mirrors if scene[name]]
     rough: Any = {"points_per_m2": data.points_per_m2, "rough_paths": data.rough_paths}
     smooth: Any = {"conductor_samples": data.samples, "boundary_samples": 0, "boundary": False}
     seed = run.seed if data.seed is None else data.seed
-    return {"seed": seed, "sampling": Sampling(depth, **smooth, **rough)}
+    return {"seed": seed, "sampling": Sampling(depth, **smooth, **rough), "mirrors": mirrors}

@@ -75,16 +75,10 @@ def report_html(
     pages = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     pages.filters |= {"shown": format_cell, "base64": base64.b64encode}
     backend = os.environ.get("INVERTWIN_BACKEND")
-    return pages.from_string(_read_resource("report.html.jinja")).render(
-        title=title,
-        status=status,
-        note=note,
-        parts=parts,
-        version=__version__,
-        command=f"invertwin {again} -o again" + (f" --backend {backend}" if backend else ""),
-        files=files,
-        policy=content_security_policy(),
-    )
+    given = {"title": title, "status": status, "note": note, "parts": parts, "files": files}
+    given |= {"version": __version__, "policy": content_security_policy()}
+    given["command"] = f"invertwin {again} -o again" + (f" --backend {backend}" if backend else "")
+    return pages.from_string(_read_resource("report.html.jinja")).render(given)
 
 
 def write_report(

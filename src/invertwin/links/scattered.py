@@ -111,17 +111,10 @@ def _build_link(
 ) -> channel.Link:
     """From one transmitter to receivers, in its axes."""
     count, turn = len(positions), sensor.mount.rotations.reshape(3, 3)
-    return channel.Link(
-        tx=sensor.positions.expand(count, 3),
-        rx=positions,
-        rotations=turn.expand(count, 3, 3),
-        tx_pattern=sensor.mount.array.pattern,
-        rx_pattern=_rotate_pattern(receivers, turn),
-        wavelength=SPEED_OF_LIGHT / frequency,
-        shared_visibility=False,
-        tx_jones=sensor.mount.array.jones,
-        rx_jones=receivers.array.jones,
-    )
+    poses = sensor.positions.expand(count, 3), positions, turn.expand(count, 3, 3)
+    patterns = sensor.mount.array.pattern, _rotate_pattern(receivers, turn)
+    polarisations = sensor.mount.array.jones, receivers.array.jones
+    return channel.Link(*poses, *patterns, SPEED_OF_LIGHT / frequency, False, *polarisations)
 
 
 def _delay_moments(

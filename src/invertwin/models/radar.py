@@ -91,9 +91,8 @@ class SurrogateMap(ForwardModel):
         if self._reference is not None:
             fixed, device, scheme = self._reference
             reference = (fixed, device.link())
-        how: dict[str, Any] = {"sampling": self.sampling, "seed": seed, "scheme": scheme}
-        how |= {"reference": reference, "coherent": self.coherent, "stretch": self.stretch}
-        how |= {"mirrors": self.mirrors}
+        how: dict[str, Any] = {n: getattr(self, n) for n in ("coherent", "stretch", "mirrors")}
+        how |= {"sampling": self.sampling, "seed": seed, "scheme": scheme, "reference": reference}
         return surrogates.surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(

@@ -241,11 +241,9 @@ class _MirrorSearch:
             paths = evaluate(pairs, place.select(index), some.select(index))
             moves = some.select(index).velocity(self.geometry)
             if moves is not None:
-                paths = replace(
-                    paths,
-                    velocity=self._image_velocity(pairs.inbound, moves),
-                    first_velocity=self._image_velocity(pairs.outbound, moves),
-                )
+                legs = pairs.outbound, pairs.inbound
+                first, last = (self._image_velocity(leg, moves) for leg in legs)
+                paths = replace(paths, velocity=last, first_velocity=first)
             found.append(paths.select(paths.has_field | (paths.power > 0)))
         return found
 

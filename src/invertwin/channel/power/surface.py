@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 from torch import Tensor
 
@@ -58,15 +59,10 @@ class ScatteringLawTables:
             known = {name: opaque_row(getattr(rows, name)) for name in _CONSTANT_COLUMNS}
         if bool((rows.amplitude == rows.amplitude[0, 0]).all()):  # conductors
             known["amplitude"] = opaque_row(rows.amplitude[:1, :1])
-        return ScatteringLawTables(
-            {name: to_float(getattr(rows, name)) for name in SCATTERING_TABLES},
-            constants=known,
-            cosine_count=rows.amplitude.shape[1],
-            has_lobe=geometry.has_lobe,
-            has_sheets=geometry.has_sheets,
-            has_refracting_bodies=geometry.has_refracting_bodies,
-            has_spread=geometry.has_spread,
-        )
+        tables = {name: to_float(getattr(rows, name)) for name in SCATTERING_TABLES}
+        has: Any = {n: value for n, value in vars(geometry).items() if n.startswith("has_")}
+        count = rows.amplitude.shape[1]
+        return ScatteringLawTables(tables, constants=known, cosine_count=count, **has)
 
     def value(self, name: str, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
         """Look up a number of each row: ``diffuse``, ``index`` or ``attenuation``.

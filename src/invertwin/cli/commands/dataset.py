@@ -146,15 +146,10 @@ def run_dataset(
             folder.write_json(_shard_row_path(number), found[number])
     rows = [shards.Shard.model_validate(found[number]) for number, _, _ in wanted]
     versions = {name: metadata.version(name) for name in _NUMERICAL_PACKAGES}
-    manifest = shards.DatasetManifest(
-        format=shards.FORMAT,
-        samples=table.samples,
-        part=part,
-        fingerprint=hashlib.sha256(text.encode()).hexdigest(),
-        versions={"invertwin": __version__, **versions},
-        arrays=_describe_arrays(run),
-        shards=rows,
-    )
+    content: Any = {"format": shards.FORMAT, "samples": table.samples, "part": part, "shards": rows}
+    content["fingerprint"] = hashlib.sha256(text.encode()).hexdigest()
+    content |= {"versions": {"invertwin": __version__, **versions}, "arrays": _describe_arrays(run)}
+    manifest = shards.DatasetManifest(**content)
     folder.write_text(shards.MANIFEST, manifest.model_dump_json(indent=1) + "\n")
     count, seconds = sum(shard.samples for shard in rows), time.perf_counter() - begin
     metrics = {

@@ -33,7 +33,8 @@ class SimulatedData(Section):
         'rough points per m²: a number, or a table by object, "*" for all others'
     )
     samples: Count = key("coherent paths", 200_000)
-    depth: Depth = key("most bounces of a path; with [chirps] it is one", 3)
+    depth: Depth = key("most bounces of a path; with [chirps] one, unless it has mirrors", 3)
+    mirrors: list[str] = key("names of smooth flat objects that show the rest again (ghosts)", [])
     rough_paths: Count = key("paths to draw of two bounces, and of each larger number", 200_000)
     snr_db: Decibels | None = key("signal-to-noise ratio per sample; without it no noise", None)
     noise_figure_db: Decibels | None = key("thermal noise of a receiver instead of snr_db", None)

@@ -203,17 +203,10 @@ def search(
     kept = list(islice(distinct, screening.fits))
 
     def fit(start: Candidate, number: int, parts: Sequence[Schedule]) -> Reconstruction:
-        return reconstruct(
-            start.scene,
-            [replace(o, parameters=copy.deepcopy(o.parameters)) for o in start.observations],
-            copy.deepcopy(parameters),
-            loss=loss,
-            optimizer=optimizer,
-            schedule=parts,
-            regularizers=regularizers,
-            callbacks=callbacks(number),
-            seed=derive_seed(seed, number),
-        )
+        own = [replace(o, parameters=copy.deepcopy(o.parameters)) for o in start.observations]
+        how: dict[str, Any] = {"loss": loss, "optimizer": optimizer, "regularizers": regularizers}
+        how |= {"callbacks": callbacks(number), "seed": derive_seed(seed, number)}
+        return reconstruct(start.scene, own, copy.deepcopy(parameters), schedule=parts, **how)
 
     if screening.shortlist and len(stages) > 1 and len(kept) > 1:
         tried = [fit(start, number, stages[:1]) for number, start in enumerate(kept)]

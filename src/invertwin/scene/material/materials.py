@@ -274,14 +274,9 @@ class RefractingBody(_RoughMedium):
         """
         square = self.complex_permittivity(frequency) * self.complex_permeability
         amplitude = self._amplitude(frequency)
-        return ScatteringLaw(
-            amplitude,
-            *self.weights(),
-            refraction=1 - amplitude**2,
-            index=fresnel.refractive_index(square),
-            attenuation=fresnel.attenuation(square, frequency),
-            **self.depolarisation_terms,
-        )
+        inside = {"index": fresnel.refractive_index(square), "refraction": 1 - amplitude**2}
+        inside["attenuation"] = fresnel.attenuation(square, frequency)
+        return ScatteringLaw(amplitude, *self.weights(), **inside, **self.depolarisation_terms)
 
 
 @dataclass(frozen=True)
