@@ -23,9 +23,6 @@ from invertwin.radar.signal.range_profile import add_noise, beat_signal, check_p
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene.scene import Scene, warn_if_purely_specular
 
-MIRRORED_DEPTH = 3
-"""Most surfaces on a path by mirrors: from a mirror to a target, and back by it."""
-
 # Motion over half a ramp is straight where it bends by less than this, in wavelengths.
 _STRAIGHT_TOLERANCE = 1e-6
 
@@ -166,17 +163,8 @@ def simulate_chirps(
     if again and impairments is not None:
         impairments.check_applicable()
     motion = scene.advance if isinstance(scene, Scene) else scene
-    plan = sampling or Sampling(depth=MIRRORED_DEPTH if mirrors else 1)
-    if mirrors and again:
-        raise InputError(
-            f"expected uniform velocities with mirrors, got {len(mirrors)} mirrors and motion that "
-            "is traced at every ramp; give a Scene with velocities and retrace=False"
-        )
-    if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
-        raise InputError(
-            f"expected visibility_every 1 with {plan.depth} bounces and retrace={retrace}, got "
-            f"{visibility_every}; it is for paths of one bounce of a function of time"
-        )
+    plan = sampling or (Sampling() if mirrors else Sampling(depth=1))
+    _check_tracing(plan, again, visibility_every, mirrors)
     # One trace draws its own points; those of several are the same.
     fixed = speckle
     if not (speckle or mirrors):
@@ -206,6 +194,22 @@ def simulate_chirps(
 
     beat = trains.simulate_chirp_train(chirps, radar.shape[1], simulate_ramp)
     return beat if impairments is None else impairments.apply(beat, radar, seed=seed)
+
+
+def _check_tracing(
+    plan: Sampling, again: bool, visibility_every: int, mirrors: Collection[str]
+) -> None:
+    """Raise an error for mirrors, or kept visibility, that the way of tracing has not."""
+    if mirrors and again:
+        raise InputError(
+            f"expected uniform velocities with mirrors, got {len(mirrors)} mirrors and motion that "
+            "is traced at every ramp; give a Scene with velocities and retrace=False"
+        )
+    if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
+        raise InputError(
+            f"expected visibility_every 1 with {plan.depth} bounces and retrace={again}, got "
+            f"{visibility_every}; it is for paths of one bounce of a function of time"
+        )
 
 
 def _trace_ramp(

@@ -22,7 +22,7 @@ from invertwin.radar.surrogate.range_doppler import range_doppler_power
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
-from invertwin.simulation import MIRRORED_DEPTH, simulate_chirps
+from invertwin.simulation import simulate_chirps
 
 _LOOK_POINTS = 300  # of the largest moving surface
 _Maps = Float[Tensor, "frame velocity range u v"]  # power of every frame
@@ -99,7 +99,7 @@ class RangeDopplerMap(ForwardModel):
         link, rest = sensor.link(), channel.without_specular(scene, self.mirrors)
         paths = channel.trace_power(rest, link, sampling=self.sampling, seed=seed)
         if self.mirrors:
-            how: Any = {"sampling": replace(self.sampling, depth=MIRRORED_DEPTH), "seed": seed}
+            how: Any = {"sampling": replace(self.sampling, depth=Sampling.depth), "seed": seed}
             paths += channel.trace_mirrored_power(scene, link, self.mirrors, **how)
         assert paths.velocity is not None
         return self.predict_paths(paths.select((paths.velocity.detach() != 0).any(1)), sensor)
@@ -140,7 +140,7 @@ class RangeDopplerMap(ForwardModel):
         }
         begun = Scene({**still, **moving})
         area = max(item.mesh.area for item in moving.values())
-        depth = MIRRORED_DEPTH if self.mirrors else 1
+        depth = Sampling.depth if self.mirrors else 1
         drawn = Sampling(depth, boundary=False, points_per_m2=_LOOK_POINTS / area)
         assert isinstance(sensor.waveform, SampledWaveform)
         channels = (*sensor.shape[1:], sensor.waveform.samples)

@@ -86,13 +86,12 @@ class SurrogateMap(ForwardModel):
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """The expected power spectrum. See ``ForwardModel.predict``."""
-        scheme: Literal["rays", "area"] = "rays"
         reference = None
         if self._reference is not None:
             fixed, device, scheme = self._reference
-            reference = (fixed, device.link())
+            reference = fixed, device.link(), scheme
         how: dict[str, Any] = {n: getattr(self, n) for n in ("coherent", "stretch", "mirrors")}
-        how |= {"sampling": self.sampling, "seed": seed, "scheme": scheme, "reference": reference}
+        how |= {"sampling": self.sampling, "seed": seed, "reference": reference}
         return surrogates.surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(

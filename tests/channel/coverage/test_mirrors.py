@@ -2,15 +2,23 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, draw_speckle, trace_field
-from invertwin.channel.coverage.mirrors import deposit_mirrored_power, trace_field_with_mirrors
+from invertwin.channel.coverage.mirrors import (
+    deposit_mirrored_power,
+    trace_field_with_mirrors,
+    trace_mirrored_power,
+)
 from invertwin.channel.coverage.single_scattering import without_specular
 from invertwin.errors import InputError
+from invertwin.models import RangeDopplerMap, SurrogateMap
+from invertwin.radar import FMCW, Chirps, Radar, linear_array, range_doppler_angle, velocity_axis
+from invertwin.radar.signal.chirps import range_rate
 from invertwin.scene import (
     Dielectric,
     Isotropic,
@@ -25,6 +33,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
+from invertwin.simulation import simulate, simulate_chirps
 from scenes import float64
 
 WAVELENGTH = 0.004
@@ -180,3 +189,97 @@ def test_what_is_no_mirror_is_named():
     )
     with pytest.raises(InputError, match=r"expected objects at rest, got velocities on ball"):
         powers(smooth)
+
+
+def moving(shift: Tensor | float = 0.0) -> Scene:
+    """A ball that moves beside a metal wall."""
+    target = replace(ball(), velocity=float64([1.0, 2.0, 0.0]))
+    return Scene({"ball": target, "wall": wall(PerfectConductor(), shift=shift)})
+
+
+def image_rates() -> tuple[float, float]:
+    """Range rates of the target, and of its image in the wall [m/s]."""
+    place, velocity = float64([3.0, 0.4, 0.0]), float64([1.0, 2.0, 0.0])
+    turned = float64([1.0, -1.0, 1.0])
+    image = place * turned - float64([0.0, 1.0, 0.0])
+    return float(place @ velocity / place.norm()), float(image @ (turned * velocity) / image.norm())
+
+
+@pytest.mark.parametrize("power", [True, False])
+def test_a_moving_ghost_has_the_velocity_of_the_image(power):
+    how = {"sampling": replace(SAMPLING, points_per_m2=20_000.0, boundary=False), "seed": 1}
+    trace = trace_mirrored_power if power else trace_field_with_mirrors
+    paths = trace(moving(), link(), ["wall"], **how)
+    radar = SimpleNamespace(link=link)
+    rates, weights = range_rate(paths, radar), paths.power + paths.coefficient.abs().square()
+    own, image = image_rates()
+    seen_last = paths.direction_cosines(link())[:, 0] < -0.2  # the receiver sees the image
+    by_both = seen_last & (paths.first[:, 1] < -0.5) & (paths.velocity.abs().sum(1) > 0)
+    by_one = seen_last & (paths.first[:, 1] > 0)
+    for rows, expected in ((by_both, image), (by_one, 0.5 * (own + image))):
+        mean = (rates * weights)[rows].sum() / weights[rows].sum()
+        assert float(mean) == pytest.approx(expected, abs=0.04)  # over the ball
+
+
+def chirp_radar() -> Radar:
+    wave = FMCW(start_frequency=76.5e9, bandwidth=1e9, duration=40e-6, samples=96)
+    row = linear_array(16, wave.wavelength / 2)
+    return Radar(linear_array(1, 1.0), row, wave, positions=torch.zeros(1, 3).double())
+
+
+@pytest.mark.slow
+def test_ghosts_in_chirp_trains_have_the_mirrored_rate():
+    radar, train = chirp_radar(), Chirps(32, 250e-6)
+    sampling = Sampling(3, points_per_m2={"ball": 4_000.0, "*": 1.0}, boundary=False)
+    how = {"sampling": sampling, "seed": 3}
+    beat = simulate_chirps(moving(), radar, train, mirrors=["wall"], **how)
+    own, image = image_rates()
+    grid = Grid(3.31, 0.05, 1, u_start=-1.3 / 3.31, u_step=0.05)
+    power = range_doppler_angle(beat, radar, grid, train, bins=128)[0, :, 0, 0, 0]
+    rates = velocity_axis(radar, train, 128)
+    near = (rates - image).abs() < 0.3
+    mean = (power * rates)[near].sum() / power[near].sum()
+    assert float(mean) == pytest.approx(image, abs=0.06)  # a third of a cell of 0.24 m/s
+    assert abs(own - image) > 0.4
+    maps = RangeDopplerMap.from_chirps(radar, grid, train, mirrors=["wall"], sampling=MAPPED)
+    shown = maps.predict(moving(), radar, 1)[0, :, 0, 0, 0]
+    strongest = maps.rates[shown.argmax()]
+    assert float(strongest) == pytest.approx(image, abs=0.12)
+
+
+MAPPED = Sampling(1, 200_000, boundary=False)
+
+
+def test_a_mirror_that_moves_is_named():
+    scene = moving()
+    away = replace(scene["wall"], velocity=float64([0.0, 0.1, 0.0]))
+    scene = Scene({"ball": scene["ball"], "wall": away})
+    with pytest.raises(InputError, match=r"expected mirrors at rest, got a velocity on 'wall'"):
+        trace_mirrored_power(scene, link(), ["wall"], sampling=SAMPLING, seed=1)
+
+
+def test_ghosts_are_in_simulated_signals_and_in_the_map_alike():
+    radar = chirp_radar()
+    scene = Scene({"ball": ball(), "wall": wall(PerfectConductor())})
+    grid = radar.grid(range_min=2.5, range_max=4.0)
+    sampling = Sampling(3, points_per_m2={"ball": 4_000.0, "*": 1.0})
+    found = torch.zeros(grid.shape).double()
+    for seed in range(16):
+        how = {"sampling": sampling, "seed": seed, "mirrors": ["wall"]}
+        found += simulate(scene, radar, grid, **how).spectrum[0] / 16
+    sampled = Sampling(3, 400_000, boundary=False)
+    expected = SurrogateMap(grid, sampling=sampled, mirrors=["wall"]).predict(scene, radar, 1)[0]
+    image = grid.u < -0.25
+    levels = [power[:, image].sum() for power in (found, expected)]
+    assert float(10 * torch.log10(levels[0] / levels[1])) == pytest.approx(0, abs=0.8)
+    bare = SurrogateMap(grid, sampling=sampled).predict(scene, radar, 1)[0]
+    assert float(bare[:, image].sum()) < 0.3 * float(levels[1])
+
+
+def test_mirrors_of_chirps_need_uniform_velocities():
+    with pytest.raises(
+        InputError, match=r"expected uniform velocities with mirrors, got 1 mirrors"
+    ):
+        simulate_chirps(
+            moving(), chirp_radar(), Chirps(4, 1e-4), seed=1, retrace=True, mirrors=["wall"]
+        )

@@ -251,8 +251,7 @@ def surrogate_spectrum(
     *,
     sampling: channel.Sampling,
     seed: int,
-    scheme: Literal["rays", "area"] = "rays",
-    reference: tuple[Scene, channel.Link] | None = None,
+    reference: tuple[Scene, channel.Link, Literal["rays", "area"]] | None = None,
     coherent: Sequence[str] = (),
     stretch: float = 1.0,
     mirrors: Sequence[str] = (),
@@ -270,7 +269,8 @@ def surrogate_spectrum(
         surrogate: kernels and their added widths.
         sampling: numbers of sampled paths.
         seed: seed of the samples.
-        scheme, reference: See ``deposit_power``.
+        reference: scene and link that define the sampling densities, and the scheme of
+            ``deposit_power``.
         coherent: names of coherent targets, see ``trace_target``.
         stretch: wavelength of their phases in wavelengths of the radar.
         mirrors: names of smooth flat objects, see ``deposit_mirrored_power``.
@@ -281,11 +281,12 @@ def surrogate_spectrum(
     link = radar.link()
     parts = deposit_targets(scene, radar, grid, surrogate, sampling, coherent, stretch)
     if set(scene.objects) - set(coherent):
-        if reference is not None:
-            reference = channel.as_absorbers(reference[0], coherent), reference[1]
         rest = channel.as_absorbers(scene, coherent)
-        drawn: Any = {"sampling": sampling, "seed": seed}
-        how: Any = {"scheme": scheme, "reference": reference, **drawn}
+        drawn: dict[str, Any] = {"sampling": sampling, "seed": seed}
+        how = dict(drawn)
+        if reference is not None:
+            fixed = channel.as_absorbers(reference[0], coherent), reference[1]
+            how |= {"reference": fixed, "scheme": reference[2]}
         bare = channel.without_specular(rest, mirrors)
         parts.append(channel.deposit_power(bare, link, grid, **how))
         if mirrors:
