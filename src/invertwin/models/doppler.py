@@ -64,6 +64,7 @@ class RangeDopplerMap(ForwardModel):
         chirps: Chirps,
         oversample: int = 2,
         sampling: Sampling | None = None,
+        mirrors: Sequence[str] = (),
     ) -> "RangeDopplerMap":
         """All range rates that the chirps tell apart.
 
@@ -73,9 +74,10 @@ class RangeDopplerMap(ForwardModel):
             chirps: Timing of the ramps.
             oversample: Bins of range rate per cell.
             sampling: How paths are sampled.
+            mirrors: Smooth flat objects at rest.
         """
-        bins = oversample * chirps.count
-        return cls(grid, chirps, velocity_axis(radar, chirps, bins), bins, sampling or cls.sampling)
+        bins, how = oversample * chirps.count, sampling or cls.sampling
+        return cls(grid, chirps, velocity_axis(radar, chirps, bins), bins, how, mirrors)
 
     def __post_init__(self) -> None:
         if self.sampling.depth != 1 or self.sampling.boundary:

@@ -17,7 +17,7 @@ from invertwin.channel.coverage.mirrors import (
 from invertwin.channel.coverage.single_scattering import without_specular
 from invertwin.errors import InputError
 from invertwin.models import RangeDopplerMap, SurrogateMap
-from invertwin.radar import FMCW, Chirps, Radar, linear_array, range_doppler_angle, velocity_axis
+from invertwin.radar import FMCW, Chirps, Radar, range_doppler_angle, velocity_axis
 from invertwin.radar.signal.chirps import range_rate
 from invertwin.scene import (
     Dielectric,
@@ -33,6 +33,7 @@ from invertwin.scene import (
     rotation_from_vector,
     sphere,
 )
+from invertwin.scene.antenna import linear_array
 from invertwin.simulation import simulate, simulate_chirps
 from scenes import float64
 
@@ -214,7 +215,9 @@ def test_a_moving_ghost_has_the_velocity_of_the_image(power):
     rates, weights = range_rate(paths, radar), paths.power + paths.coefficient.abs().square()
     own, image = image_rates()
     seen_last = paths.direction_cosines(link())[:, 0] < -0.2  # the receiver sees the image
-    by_both = seen_last & (paths.first[:, 1] < -0.5) & (paths.velocity.abs().sum(1) > 0)
+    velocity = paths.velocity
+    assert velocity is not None
+    by_both = seen_last & (paths.first[:, 1] < -0.5) & (velocity.abs().sum(1) > 0)
     by_one = seen_last & (paths.first[:, 1] > 0)
     for rows, expected in ((by_both, image), (by_one, 0.5 * (own + image))):
         mean = (rates * weights)[rows].sum() / weights[rows].sum()
@@ -234,7 +237,7 @@ def test_ghosts_in_chirp_trains_have_the_mirrored_rate():
     how = {"sampling": sampling, "seed": 3}
     beat = simulate_chirps(moving(), radar, train, mirrors=["wall"], **how)
     own, image = image_rates()
-    grid = Grid(3.31, 0.05, 1, u_start=-1.3 / 3.31, u_step=0.05)
+    grid = Grid(3.31, 0.05, 1, u_start=-1.3 / 3.31, u_step=0.05, u_count=2)
     power = range_doppler_angle(beat, radar, grid, train, bins=128)[0, :, 0, 0, 0]
     rates = velocity_axis(radar, train, 128)
     near = (rates - image).abs() < 0.3
@@ -258,9 +261,11 @@ def test_a_mirror_that_moves_is_named():
         trace_mirrored_power(scene, link(), ["wall"], sampling=SAMPLING, seed=1)
 
 
+@pytest.mark.slow
 def test_ghosts_are_in_simulated_signals_and_in_the_map_alike():
     radar = chirp_radar()
-    scene = Scene({"ball": ball(), "wall": wall(PerfectConductor())})
+    # A wall that ends before its flash, whose sidelobes would be in the signals alone.
+    scene = Scene({"ball": ball(), "wall": wall(PerfectConductor(), 1.5)})
     grid = radar.grid(range_min=2.5, range_max=4.0)
     sampling = Sampling(3, points_per_m2={"ball": 4_000.0, "*": 1.0})
     found = torch.zeros(grid.shape).double()
@@ -272,8 +277,8 @@ def test_ghosts_are_in_simulated_signals_and_in_the_map_alike():
     image = grid.u < -0.25
     levels = [power[:, image].sum() for power in (found, expected)]
     assert float(10 * torch.log10(levels[0] / levels[1])) == pytest.approx(0, abs=0.8)
-    bare = SurrogateMap(grid, sampling=sampled).predict(scene, radar, 1)[0]
-    assert float(bare[:, image].sum()) < 0.3 * float(levels[1])
+    alone = SurrogateMap(grid, sampling=sampled).predict(Scene({"ball": ball()}), radar, 1)[0]
+    assert float(alone[:, image].sum()) < 0.05 * float(levels[1])
 
 
 def test_mirrors_of_chirps_need_uniform_velocities():
