@@ -5,17 +5,17 @@
 A ball, a plate and a person, all rough, stand beside a smooth concrete wall, a metal wall, and
 above a smooth concrete floor, 3 m in front of a 77 GHz radar of 1 GHz bandwidth and 16 elements
 along the direction away from the mirror. Mirrors end before the radar's own flash. The reference
-has no mirror: the target is seen by the image of the transmitter, of the receiver, or of both, times
-Fresnel's power coefficient of one reflection or of two, at the angle of the target's centre.
+has no mirror: the target is seen by the image of the transmitter, of the receiver, or of both,
+times Fresnel's power coefficient of one reflection or of two, at the angle of the target's centre.
 
 - `position`: distance of the centres of power of a ghost and of its reference over range and
-  direction, in resolution cells; of the first order (one reflection) and of the second (both legs).
+  direction, in resolution cells; of the first order (one reflection), of the second (both legs).
 - `level`: their difference of total power [dB].
-- `models`: difference between the power of field paths (`simulate`) and of the map (`SurrogateMap`),
-  over all ghosts [dB], the mean of its magnitude over the scenes.
-- `derivative`: relative error of reverse-mode derivatives of a weighted map of a crate behind a post
-  beside a wall that ends, against central differences: by the place of the target, that of the
-  wall, and the permittivity.
+- `models`: difference between the power of field paths (`simulate`) and that of the map
+  (`SurrogateMap`), over all ghosts [dB], the mean of its magnitude over the scenes.
+- `derivative`: relative error of reverse-mode derivatives of a weighted map of a crate behind a
+  post beside a wall that ends, against central differences: by the place of the target, that of
+  the wall, and the permittivity.
 - `cost`: time of a step of `SurrogateMap` (map and its derivative with respect to the target's
   place) with the mirror named over that without, median of turns.
 
@@ -150,7 +150,7 @@ def measure_ghosts(kind: str, material: Material, up: bool, samples: int) -> dic
     # The receiver sees a ghost of the first order at the target, and another one at its image.
     middle = 0.5 * (math.hypot(AHEAD, OFFSET) + math.hypot(AHEAD, 3 * OFFSET))
     once = reflectance(material, up)
-    direct = {**how, "sampling": Sampling(1, samples, boundary=False)}
+    direct: dict[str, Any] = {**how, "sampling": Sampling(1, samples, boundary=False)}
     seen = deposit_power(free, link(image, here), grid, **direct)[0] * once
     mirrored = mirror_directions(free, link(here, image), grid, up, direct) * once
     second = mirror_directions(free, link(image, image), grid, up, direct) * once**2
