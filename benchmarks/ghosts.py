@@ -6,7 +6,7 @@ A ball, a plate and a person, all rough, stand beside a smooth concrete wall, a 
 above a smooth concrete floor, 3 m in front of a 77 GHz radar of 1 GHz bandwidth and 16 elements
 along the direction away from the mirror. Mirrors end before the radar's own flash. The reference
 has no mirror: the target is seen by the image of the transmitter, of the receiver, or of both,
-times Fresnel's power coefficient of one reflection or of two, at the angle of the target's centre.
+times Fresnel's power coefficients at the angles of each point.
 
 - `position`: distance of the centres of power of a ghost and of its reference over range and
   direction, in resolution cells; of the first order (one reflection), of the second (both legs).
@@ -39,8 +39,9 @@ from invertwin.channel import (
     Link,
     Sampling,
     deposit_mirrored_power,
-    deposit_power,
+    deposit_paths,
     trace_field_with_mirrors,
+    trace_power,
 )
 from invertwin.models import SurrogateMap
 from invertwin.radar import FMCW, Radar
@@ -116,16 +117,29 @@ def link(tx: Tensor, rx: Tensor) -> Link:
     return Link(tx[None], rx[None], axes, Isotropic(), Isotropic(), WAVELENGTH, False)
 
 
-def reflectance(material: Material, up: bool) -> float:
-    """Fresnel's power coefficient of V at the angle of the target's centre."""
+def reflectance(material: Material, way: Tensor, up: bool) -> Tensor:
+    """Fresnel's power coefficient of V for rays from an image through the mirror."""
+    cosine = way[:, 2 if up else 1].abs() / way.norm(dim=1)
     if isinstance(material, PerfectConductor):
-        return 1.0
-    way = vector(AHEAD, 0.0, 3 * OFFSET) / math.hypot(AHEAD, 3 * OFFSET)
-    cosine = float(way[2])
-    root = math.sqrt(PERMITTIVITY - 1 + cosine**2)
-    if up:  # V lies in the plane of incidence
-        return ((PERMITTIVITY * cosine - root) / (PERMITTIVITY * cosine + root)) ** 2
-    return ((cosine - root) / (cosine + root)) ** 2
+        return torch.ones_like(cosine)
+    root = (PERMITTIVITY - 1 + cosine**2).sqrt()
+    along = PERMITTIVITY * cosine if up else cosine  # above a floor V is in the plane of incidence
+    return ((along - root) / (along + root)).square()
+
+
+def image_map(
+    scene: Scene, ends: list[Tensor], material: Material, up: bool, grid: Grid, samples: int
+) -> Tensor:
+    """The map that a transmitter and a receiver at images, or not, have of a free target."""
+    of = link(*ends)
+    paths = trace_power(scene, of, sampling=Sampling(1, samples, boundary=False), seed=1)
+    weight = torch.ones_like(paths.power)
+    for end, point in zip(ends, (paths.first, paths.last), strict=True):
+        if end.any():
+            weight = weight * reflectance(material, point - end, up)
+    found = deposit_paths(replace(paths, power=paths.power * weight), of, grid)[0]
+    # The image of a receiver sees the target turned over.
+    return found.flip(2 if up else 1) if ends[1].any() else found
 
 
 def moments(power: Tensor, grid: Grid) -> tuple[float, Tensor]:
@@ -147,24 +161,24 @@ def measure_ghosts(kind: str, material: Material, up: bool, samples: int) -> dic
     image = vector(0, 0, -2 * OFFSET) if up else vector(0, -2 * OFFSET, 0)
     how: dict[str, Any] = {"sampling": Sampling(3, samples, boundary=False), "seed": 1}
     found = deposit_mirrored_power(scene, link(here, here), grid, ["mirror"], **how)[0]
-    # The receiver sees a ghost of the first order at the target, and another one at its image.
     middle = 0.5 * (math.hypot(AHEAD, OFFSET) + math.hypot(AHEAD, 3 * OFFSET))
-    once = reflectance(material, up)
-    direct: dict[str, Any] = {**how, "sampling": Sampling(1, samples, boundary=False)}
-    seen = deposit_power(free, link(image, here), grid, **direct)[0] * once
-    mirrored = mirror_directions(free, link(here, image), grid, up, direct) * once
-    second = mirror_directions(free, link(image, image), grid, up, direct) * once**2
+    pairs = [image, here], [here, image], [image, image]
+    maps = [image_map(free, ends, material, up, grid, samples // 4) for ends in pairs]
+    reference = torch.stack(maps).sum(0)
     far = (grid.ranges > 0.5 * (middle + math.hypot(AHEAD, 3 * OFFSET)))[:, None, None]
     at_image = ((grid.v if up else grid.u) < 0).reshape((1, 1, -1) if up else (1, -1, 1))
     windows = {"first": [~at_image, at_image & ~far], "second": [at_image & far]}
-    reference = seen + mirrored + second
     errors: dict[str, float] = {}
     for order, parts in windows.items():
         pairs = [
             [moments(power * inside, grid) for power in (found, reference)] for inside in parts
         ]
-        errors[f"level_{order}_db"] = max(abs(10 * math.log10(a[0] / b[0])) for a, b in pairs)
-        errors[f"position_{order}"] = max(float((a[1] - b[1]).norm()) for a, b in pairs)
+        errors[f"level_{order}_db"] = max(
+            abs(10 * math.log10(a[0] / b[0])) for a, b in found_and_expected
+        )
+        errors[f"position_{order}"] = max(
+            float((a[1] - b[1]).norm()) for a, b in found_and_expected
+        )
     fields = trace_field_with_mirrors(
         scene, link(here, here), ["mirror"], seed=2,
         sampling=Sampling(3, points_per_m2={"target": 20_000.0, "*": 1.0}, boundary=False),
@@ -178,12 +192,6 @@ def is_mirrored(first: Tensor, last: Tensor, up: bool) -> Tensor:
     """Mask of paths that an antenna sees behind the mirror."""
     side = 2 if up else 1
     return (first[:, side] < -OFFSET) | (last[:, side] < -OFFSET)
-
-
-def mirror_directions(scene: Scene, of: Link, grid: Grid, up: bool, how: dict[str, Any]) -> Tensor:
-    """A map at an image of the receiver, whose directions are turned over."""
-    found = deposit_power(scene, of, grid, **how)[0]
-    return found.flip(2) if up else found.flip(1)
 
 
 def crate(shift: Tensor, aside: Tensor, permittivity: Tensor) -> Scene:

@@ -78,11 +78,13 @@ def _simulate_frames(
     found = simulate_exact(run, scene, radar, grid)
     seconds = time.perf_counter() - begin
     data = require_simulated_data(run)
-    model = SurrogateMap(grid, sampling=Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES))
+    drawn = Sampling(depth=data.depth, samples=_SURROGATE_SAMPLES)
+    model = SurrogateMap(grid, sampling=drawn, mirrors=data.mirrors)
     with torch.no_grad():
         smooth = model.predict(scene, radar, run.seed)
     Capture.from_beat(found.beat, radar).save(folder.file("capture.nc"))
-    one_bounce = replace(model, sampling=Sampling(1, points_per_m2=data.points_per_m2))
+    drawn = Sampling(1, points_per_m2=data.points_per_m2)
+    one_bounce = SurrogateMap(grid, sampling=drawn)
     alike = surrogate_correlation(scene, radar.frames([0]), one_bounce, seed=run.seed)
     peak, power = find_peak(found.spectrum.sum(0), grid), float(found.spectrum.max())
     hidden = ("peak_velocity_m_s", "peak_azimuth_deg" if grid.u_count == 1 else "")
