@@ -162,23 +162,17 @@ def measure_ghosts(kind: str, material: Material, up: bool, samples: int) -> dic
     how: dict[str, Any] = {"sampling": Sampling(3, samples, boundary=False), "seed": 1}
     found = deposit_mirrored_power(scene, link(here, here), grid, ["mirror"], **how)[0]
     middle = 0.5 * (math.hypot(AHEAD, OFFSET) + math.hypot(AHEAD, 3 * OFFSET))
-    pairs = [image, here], [here, image], [image, image]
-    maps = [image_map(free, ends, material, up, grid, samples // 4) for ends in pairs]
+    seen_by = [image, here], [here, image], [image, image]
+    maps = [image_map(free, ends, material, up, grid, samples // 4) for ends in seen_by]
     reference = torch.stack(maps).sum(0)
     far = (grid.ranges > 0.5 * (middle + math.hypot(AHEAD, 3 * OFFSET)))[:, None, None]
     at_image = ((grid.v if up else grid.u) < 0).reshape((1, 1, -1) if up else (1, -1, 1))
     windows = {"first": [~at_image, at_image & ~far], "second": [at_image & far]}
     errors: dict[str, float] = {}
     for order, parts in windows.items():
-        pairs = [
-            [moments(power * inside, grid) for power in (found, reference)] for inside in parts
-        ]
-        errors[f"level_{order}_db"] = max(
-            abs(10 * math.log10(a[0] / b[0])) for a, b in found_and_expected
-        )
-        errors[f"position_{order}"] = max(
-            float((a[1] - b[1]).norm()) for a, b in found_and_expected
-        )
+        both = [[moments(power * inside, grid) for power in (found, reference)] for inside in parts]
+        errors[f"level_{order}_db"] = max(abs(10 * math.log10(a[0] / b[0])) for a, b in both)
+        errors[f"position_{order}"] = max(float((a[1] - b[1]).norm()) for a, b in both)
     fields = trace_field_with_mirrors(
         scene, link(here, here), ["mirror"], seed=2,
         sampling=Sampling(3, points_per_m2={"target": 20_000.0, "*": 1.0}, boundary=False),
