@@ -98,7 +98,7 @@ def check_data(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def traced(*args, **options):
         raise FieldsTracedError
 
-    monkeypatch.setattr("invertwin.simulation.trace_field", traced)
+    monkeypatch.setattr("invertwin.channel.trace_field_with_mirrors", traced)
     for part in list(run.observations.values()) or [run]:
         table, bins = part.radar or run.radar, part.grid or run.grid
         assert table is not None

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from invertwin import simulation
+from invertwin import channel
 from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.radar import FMCW, Radar
@@ -95,13 +95,13 @@ def test_conductors_and_velocities_are_followed_too():
 
 
 def test_rays_are_traced_once_for_several_loops(monkeypatch):
-    times, trace = [], simulation.trace_field
+    times, trace = [], channel.trace_field_with_mirrors
 
     def counted(*given, **options):
         times.append(1)
         return trace(*given, **options)
 
-    monkeypatch.setattr(simulation, "trace_field", counted)
+    monkeypatch.setattr(channel, "trace_field_with_mirrors", counted)
     simulate_chirps(rotor, radar(), CHIRPS, seed=1, sampling=FEW, visibility_every=3)
     assert len(times) == 3
 
