@@ -138,8 +138,7 @@ def simulate_chirps(
         radar: Arrays, waveform and poses.
         chirps: Timing of the ramps.
         seed: Places and phases; those of rough points belong to the surface and move with it.
-        sampling: How paths are sampled, of one bounce; None = ``Sampling(depth=1)``, and 3 with
-            mirrors.
+        sampling: How paths are sampled, of one bounce; None: depth 1, and 3 with mirrors.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
             points seen at the start of the frame. A function of time always does, but see the next.
         visibility_every: Loops for which visibility and amplitudes of a function of time are kept;
@@ -147,8 +146,7 @@ def simulate_chirps(
             their surface at every ramp, and what stands still is summed once. Without derivatives.
         speckle: Rough points to use again.
         impairments: Impairments of the front end; phase noise only without retracing.
-        mirrors: Names of smooth flat objects at rest, as of ``simulate``. Paths by them meet up to
-            ``sampling.depth`` surfaces; not with motion that is traced at every ramp.
+        mirrors: Names as of ``simulate``, of objects at rest; not with motion traced at every ramp.
 
     Raises:
         InputError: See ``trace_field`` and ``moving_beat``; a function of time whose objects
@@ -165,13 +163,11 @@ def simulate_chirps(
     motion = scene.advance if isinstance(scene, Scene) else scene
     plan = sampling or (Sampling() if mirrors else Sampling(depth=1))
     _check_tracing(plan, again, visibility_every, mirrors)
-    # One trace draws its own points; those of several are the same.
-    fixed = speckle
-    if not (speckle or mirrors):
-        fixed = channel.draw_speckle(motion(0.0), radar.link(), plan, seed)
+    if not (speckle or mirrors):  # one trace draws its own points; those of several are the same
+        speckle = channel.draw_speckle(motion(0.0), radar.link(), plan, seed)
 
     def trace_instant(instant: Scene) -> Paths:
-        how: Any = {"sampling": plan, "seed": seed, "speckle": fixed}
+        how: Any = {"sampling": plan, "seed": seed, "speckle": speckle}
         return channel.trace_field_with_mirrors(instant, radar.link(), mirrors, **how)
 
     if isinstance(scene, Scene) and not again:
