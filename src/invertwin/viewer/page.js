@@ -54,24 +54,101 @@
   }));
   paths.kind = "lines";
   if (surfaces.length && sensors.some((x) => x.places.length)) layers.push(paths, visible, edges, feeding);
+  const [low, high] = extent(layers.filter((layer) => layer.shown));
+  const up = unit(data.up), size = Math.hypot(...add(high, low, -1)) || 1;
+  const ground = groundLines();
+  layers.push(ground.layer);
   for (const layer of layers) { layer.places = gl.createBuffer(); layer.corners = gl.createBuffer(); load(layer); }
   function load(layer) {
+    // A name stands above its object.
+    if (layer.group === "twin" || layer.group === "radar") {
+      const [least, most] = extent([layer]);
+      layer.top = least.map((x, k) => (up[k] > 0.5 ? most[k] : up[k] < -0.5 ? x : (x + most[k]) / 2));
+    }
     gl.bindBuffer(gl.ARRAY_BUFFER, layer.places);
     gl.bufferData(gl.ARRAY_BUFFER, layer.points, gl.DYNAMIC_DRAW);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, layer.corners);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, layer.faces, gl.DYNAMIC_DRAW);
   }
 
-  const [low, high] = data.box, up = unit(data.up), size = Math.hypot(...add(high, low, -1)) || 1;
+  // The least and the largest coordinates of all points of some layers; those of the box without any.
+  function extent(some) {
+    const least = [Infinity, Infinity, Infinity], most = [-Infinity, -Infinity, -Infinity];
+    for (const { points } of some)
+      for (let k = 0; k < points.length; k++) {
+        least[k % 3] = Math.min(least[k % 3], points[k]);
+        most[k % 3] = Math.max(most[k % 3], points[k]);
+      }
+    return least[0] <= most[0] ? [least, most] : data.box;
+  }
+  const extentOf = (values) => values.reduce(([a, b], x) => [Math.min(a, x), Math.max(b, x)], [Infinity, -Infinity]);
+  // 1, 2 or 5 times a power of ten, from a length upwards.
+  function roundStep(length) {
+    const power = 10 ** Math.floor(Math.log10(Math.max(length, 1e-6)));
+    return power * [1, 2, 5, 10].find((k) => k * power >= 0.999 * length);
+  }
+  // A grid below the scene, with metres along the two sides that the first picture has in front.
+  function groundLines() {
+    const upright = up.findIndex((x) => Math.abs(x) > 0.5), flat = [0, 1, 2].filter((k) => k !== upright);
+    const cell = roundStep(Math.max(...flat.map((k) => high[k] - low[k])) / 6);
+    const start = low.map((x) => cell * Math.floor(x / cell));
+    const end = high.map((x, k) => Math.max(cell * Math.ceil(x / cell), start[k] + cell));
+    const at = (a, first, b, second) => {
+      const place = [0, 0, 0];
+      place[a] = first;
+      place[b] = second;
+      place[upright] = up[upright] > 0 ? low[upright] - 1e-3 * cell : high[upright] + 1e-3 * cell;
+      return place;
+    };
+    const lines = [], marks = [];
+    for (const [a, b] of [flat, [...flat].reverse()]) {
+      const front = data.ahead[b] - 0.2 * cross(up, data.ahead)[b] > 0 ? start[b] : end[b];
+      for (let k = 0; k <= Math.round((end[a] - start[a]) / cell); k++) {
+        const x = start[a] + k * cell;
+        lines.push(...at(a, x, b, start[b]), ...at(a, x, b, end[b]));
+        if (x > start[a] && x < end[a] - cell / 2) marks.push([`${+x.toFixed(6)}`, at(a, x, b, front)]);
+      }
+      marks.push([`${"xyz"[a]} [m]`, at(a, data.ahead[a] < 0 ? start[a] : end[a], b, front)]);
+    }
+    const none = new Uint32Array(0), color = [128, 134, 144];
+    return { marks, layer: { name: "ground", group: "ground", kind: "lines", color, opacity: 0.5, shown: true,
+      points: new Float32Array(lines), faces: none } };
+  }
+
   const ahead = unit(add(data.ahead, up, -dot(data.ahead, up))), side = cross(up, ahead);
-  let middle = add(low, high).map((x) => x / 2), turn = 0.35, tilt = 0.4, distance = 1.2 * size;
-  function draw() {
-    const width = (canvas.width = canvas.clientWidth * devicePixelRatio);
-    const height = (canvas.height = canvas.clientHeight * devicePixelRatio);
+  const focus = 1.8, words = part("words").getContext("2d"), dark = matchMedia("(prefers-color-scheme: dark)");
+  let middle = add(low, high).map((x) => x / 2), turn = 0.21, tilt = 0.49, distance = 0;
+  function axesOfCamera() {
     const level = add(ahead.map((x) => x * -Math.cos(turn)), side, Math.sin(turn));
-    const back = add(level.map((x) => x * Math.cos(tilt)), up, Math.sin(tilt));
-    const eye = add(middle, back, distance), right = unit(cross(up, back)), top = cross(back, right);
-    const near = distance / 100, far = distance + 20 * size, focus = 1.8, depth = near - far;
+    const back = add(level.map((x) => x * Math.cos(tilt)), up, Math.sin(tilt)), right = unit(cross(up, back));
+    return [right, cross(back, right), back];
+  }
+  // The first picture holds all that is shown, in its middle.
+  function frame() {
+    const [right, top, back] = axesOfCamera(), room = Math.min(canvas.clientWidth / canvas.clientHeight, 1.6);
+    const points = layers.filter((layer) => layer.shown).flatMap((layer) =>
+      Array.from({ length: layer.points.length / 3 }, (_, k) => layer.points.subarray(3 * k, 3 * k + 3)));
+    for (let turns = 0; turns < 3; turns++) {
+      let most = 0;
+      for (const point of points) {
+        const away = add(point, middle, -1), wide = Math.abs(dot(away, right)) / room;
+        most = Math.max(most, dot(away, back) + (focus / 0.88) * Math.max(wide, Math.abs(dot(away, top))));
+      }
+      distance = most || size;
+      for (const axis of [right, top]) {
+        const seen = extentOf(points.map((point) => {
+          const away = add(point, middle, -1);
+          return dot(away, axis) / (distance - dot(away, back));
+        }));
+        middle = add(middle, axis, (distance * (seen[0] + seen[1])) / 2);
+      }
+    }
+  }
+  function draw(event) {
+    const width = (canvas.width = words.canvas.width = canvas.clientWidth * devicePixelRatio);
+    const height = (canvas.height = words.canvas.height = canvas.clientHeight * devicePixelRatio);
+    const [right, top, back] = axesOfCamera(), eye = add(middle, back, distance);
+    const near = distance / 100, far = distance + 20 * size, depth = near - far;
     const rows = [
       [right, (focus * height) / width], [top, focus], [back, (near + far) / depth], [back, -1],
     ].map(([axis, scale]) => [...axis.map((x) => x * scale), -dot(axis, eye) * scale]);
@@ -80,7 +157,7 @@
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.BLEND);
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.uniformMatrix4fv(uniform("camera"), true, rows.flat());
     gl.uniform3fv(uniform("eye"), eye);
     // Points on a surface are not hidden by it.
@@ -102,6 +179,32 @@
       if (surface) gl.drawElements(gl.TRIANGLES, layer.faces.length, gl.UNSIGNED_INT, 0);
       else gl.drawArrays(layer.kind === "lines" ? gl.LINES : gl.POINTS, 0, layer.points.length / 3);
     }
+    write(rows, width, height, dark.matches && event?.type !== "beforeprint");
+  }
+  // Names and metres, inside of the picture, and none over another.
+  function write(rows, width, height, light) {
+    const written = [], scale = devicePixelRatio, named = layers.filter((layer) => layer.shown && layer.top);
+    words.lineWidth = 3 * scale;
+    words.lineJoin = "round";
+    words.textAlign = "center";
+    words.textBaseline = "middle";
+    const put = (text, place, [x, y, , w] = rows.map((row) => dot(row.slice(0, 3), place) + row[3])) => {
+      const half = words.measureText(text).width / 2 + 3 * scale, line = 8 * scale;
+      const across = Math.min(Math.max((0.5 + x / w / 2) * width, half), width - half), down = (0.5 - y / w / 2) * height;
+      const meets = ([a, b, c]) => Math.abs(a - across) < half + c && Math.abs(b - down) < 2 * line;
+      if (w <= 0 || Math.abs(x / w) > 1 || Math.abs(y / w) > 0.97 || written.some(meets)) return;
+      written.push([across, down, half]);
+      words.strokeText(text, across, down);
+      words.fillText(text, across, down);
+    };
+    words.strokeStyle = light ? "#15181ccc" : "#ffffffcc";
+    words.fillStyle = light ? "#e6e8eb" : "#1b1f24";
+    words.font = `${13 * scale}px system-ui, sans-serif`;
+    for (const layer of named) put(layer.name.split("/").at(-1).slice(0, 24), add(layer.top, up, 0.03 * distance));
+    if (!ground.layer.shown) return;
+    words.fillStyle = light ? "#a8afb9" : "#59616d";
+    words.font = `${11 * scale}px system-ui, sans-serif`;
+    for (const [text, place] of ground.marks) put(text, place);
   }
 
   const colors = { power: new Uint8Array(bytes(data.colors.power)), apart: new Uint8Array(bytes(data.colors.apart)) };
@@ -109,8 +212,14 @@
   let own = sensors[0], position = 0, chosen = null, waiting;
   for (const name of [named.measured, named.simulated, named.residual]) {
     const figure = document.createElement("figure"), picture = document.createElement("canvas");
+    const box = document.createElement("div"), bar = document.createElement("canvas");
     figure.style.margin = 0;
-    figure.append(name, picture);
+    figure.append(name === named.residual ? `${name} [dB]` : `${name} [dB below peak]`, box);
+    box.style = "position: relative; margin: .4rem 3rem 1.5rem 2rem; font-size: 11px; line-height: 1";
+    bar.style = "position: absolute; left: calc(100% + 6px); top: 0; width: 9px; height: 100%";
+    bar.ariaHidden = "true";
+    drawBar(bar, name === named.residual ? colors.apart : colors.power);
+    box.append(picture, bar);
     picture.tabIndex = 0;
     picture.style = "display: block; width: 100%; height: 7rem; cursor: crosshair";
     picture.setAttribute("role", "img");
@@ -130,7 +239,37 @@
     part("maps").append(figure);
   }
   const axes = document.createElement("small");
+  axes.textContent = "range [m] upwards, azimuth [°] to the left";
   part("maps").append(axes);
+  function drawBar(bar, table) {
+    [bar.width, bar.height] = [1, 256];
+    const image = new ImageData(1, 256);
+    for (let k = 0; k < 256; k++) image.data.set([...table.subarray(3 * (255 - k), 3 * (256 - k)), 255], 4 * k);
+    bar.getContext("2d").putImageData(image, 0, 0);
+  }
+  // Metres, degrees and decibels beside the bins of a map.
+  function mark(picture, name) {
+    for (const old of picture.parentElement.querySelectorAll("span")) old.remove();
+    const put = (text, style) => {
+      const label = document.createElement("span");
+      label.textContent = text;
+      label.style = `position: absolute; white-space: nowrap; ${style}`;
+      picture.parentElement.append(label);
+    };
+    const [ends, steps] = [[center(0, 0), center(...own.shape)], [own.grid[1], own.grid[3]]];
+    const [[near, first], [far, last]] = ends.map((end) => end.map((x, k) => x - steps[k] / 2));
+    const apart = roundStep((far - near) / 4);
+    for (let x = apart * Math.ceil(near / apart); x <= far; x += apart)
+      put(+x.toFixed(6), `right: calc(100% + 4px); bottom: ${(100 * (x - near)) / (far - near)}%; transform: translateY(50%)`);
+    const angle = (u) => (180 / Math.PI) * Math.asin(Math.max(-1, Math.min(1, u)));
+    const turn = [5, 10, 15, 30].find((x) => (angle(last) - angle(first)) / x < 6) ?? 30;
+    for (let x = turn * Math.ceil(angle(first) / turn); own.shape[1] > 1 && x <= angle(last); x += turn) {
+      const left = (last - Math.sin((x * Math.PI) / 180)) / (last - first);
+      if (Math.abs(x) < 75) put(x, `top: calc(100% + 4px); left: ${100 * left}%; transform: translateX(-50%)`);
+    }
+    const levels = name === named.residual ? [data.largest, 0, -data.largest] : [0, -data.depth / 2, -data.depth];
+    levels.forEach((level, k) => put(level, `left: calc(100% + 19px); top: ${50 * k}%; transform: translateY(-50%)`));
+  }
   function choose(...bin) {
     chosen = bin.map((x, n) => Math.max(0, Math.min(own.shape[n] - 1, x)));
     follow();
@@ -217,10 +356,7 @@
     to.max = own.frames.length - 1;
     to.value = 0;
     to.nextElementSibling.textContent = own.frames[0];
-    const ends = [center(0, 0), center(...add(own.shape, [1, 1], -1))];
-    axes.textContent = `range upwards from ${ends[0][0].toFixed(2)} to ${ends[1][0].toFixed(2)} m, ` +
-      `u from ${ends[1][1].toFixed(2)} on the left to ${ends[0][1].toFixed(2)}; ` +
-      `${data.depth} dB below the peak, residual ±${data.largest} dB`;
+    pictures.forEach(mark);
     part("told").textContent = "Click a bin of a map: the points that feed it light up.";
     follow();
   }
@@ -309,8 +445,9 @@
   canvas.addEventListener("keydown", (event) => {
     if (event.key in keys) { event.preventDefault(); move(...keys[event.key]); draw(); }
   });
-  addEventListener("resize", draw);
-  addEventListener("beforeprint", draw);
+  for (const name of ["resize", "beforeprint", "afterprint"]) addEventListener(name, draw);
+  dark.addEventListener("change", draw);
+  frame();
   if (own) sense(0);
   else draw();
 })();
