@@ -185,4 +185,4 @@ def test_ranges_without_echoes_are_left_out_and_the_label_says_so():
     (axes,) = cells(plotting.spectrum({"data": spectrum}, grid))
     # Four bins before and behind echoes from 6 to 7 m.
     assert axes.get_ylim() == pytest.approx((3.75, 9.25))
-    assert axes.get_ylabel() == "range [m], of 1 to 20.5"
+    assert axes.get_ylabel() == "range [m], cropped from 1 to 20.5"

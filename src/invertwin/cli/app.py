@@ -41,7 +41,7 @@ class _CommandGroup(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         self._add_plugins()
-        return super().list_commands(ctx)
+        return sorted(self.commands, key=lambda k: _PANELS.index(self.commands[k].rich_help_panel))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name not in self.commands:
@@ -53,13 +53,14 @@ class _CommandGroup(TyperGroup):
 
         found = typer.Typer()
         for name, function in load_plugins().commands.items():
-            found.command(name, rich_help_panel="Plugins")(function)
+            found.command(name, rich_help_panel=_PLUGINS)(function)
         if found.registered_commands:
             self.commands = {**self.commands, **typer.main.get_group(found).commands}
 
 
 # Panels of the list of commands.
-_RUN, _DATA, _LEARN, _DEVELOP = "Run files", "Recordings", "Begin", "Develop"
+_LEARN, _DATA, _RUN, _DEVELOP, _PLUGINS = "Begin", "Recordings", "Run files", "Develop", "Plugins"
+_PANELS = (_LEARN, _DATA, _RUN, _DEVELOP, _PLUGINS)
 _PLAIN: dict[str, Any] = {"pretty_exceptions_enable": False, "add_completion": False}
 app = typer.Typer(name="invertwin", cls=_CommandGroup, no_args_is_help=True, **_PLAIN)
 

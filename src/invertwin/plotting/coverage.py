@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -116,7 +117,8 @@ def project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
 
 
 def _format_axes(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any) -> None:
-    axes.add_collection(LineCollection(lines, colors="black", linewidths=0.6))
+    halo = [withStroke(linewidth=1.8, foreground="white", alpha=0.7)]  # seen on dark pages
+    axes.add_collection(LineCollection(lines, colors="black", linewidths=0.6, path_effects=halo))
     if marks is not None:
         axes.plot(marks[:, 0], marks[:, 1], "^", color="#c0143c", markeredgecolor="white")
     axes.set_aspect("equal")

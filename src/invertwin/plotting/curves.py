@@ -118,13 +118,13 @@ def rcs_curves(
         least: dB below the largest value that are shown.
     """
     figure = Figure(figsize=(8, 2.7 * len(panels)), layout="constrained")
-    for axes, (title, curves) in zip(
-        figure.subplots(len(panels), 1, squeeze=False)[:, 0], panels.items(), strict=True
-    ):
+    rows = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axes, (title, curves) in zip(rows, panels.items(), strict=True):
         top = max(float(np.nanmax(numbers(curve))) for curve in curves.values())
         _lines(axes, curves, across)
-        axes.set(title=legible(title), xlabel=label, ylabel="RCS [dBsm]")
-        axes.set_ylim(top - least, top + 3)
+        axes.set(
+            title=legible(title), xlabel=label, ylabel="RCS [dBsm]", ylim=(top - least, top + 3)
+        )
     return figure
 
 
@@ -170,13 +170,11 @@ def rcs_profile(levels: Tensor, ranges: Tensor, across: Tensor, label: str) -> F
     top = float(values.max())
     if values.shape[1] == 1:
         axes.plot(place, values[:, 0], color=color(0), lw=1.1)
-        axes.set(xlabel="range beyond the origin [m]", ylabel="RCS [dBsm]")
-        axes.set_ylim(top - _SPAN, top + 3)
+        ends = (top - _SPAN, top + 3)
+        axes.set(xlabel="range beyond the origin [m]", ylabel="RCS [dBsm]", ylim=ends)
         axes.grid(alpha=0.3)
         return figure
-    drawn = axes.pcolormesh(
-        numbers(across), place, values, vmin=top - _SPAN, vmax=top, shading="nearest"
-    )
+    drawn = axes.pcolormesh(numbers(across), place, values, vmin=top - _SPAN, vmax=top)
     axes.set(xlabel=label, ylabel="range beyond the origin [m]")
     figure.colorbar(drawn, ax=axes, label="RCS [dBsm]")
     return figure
@@ -191,11 +189,9 @@ def rcs_image(levels: Tensor, extent: float, labels: tuple[str, str]) -> Figure:
         labels: of both axes.
     """
     figure, (axes,) = row_of_axes(1, (5.4, 4.6))
-    values = numbers(levels)
+    values, ends = numbers(levels), 2 * (-extent, extent)
     top = float(values.max())
-    drawn = axes.imshow(
-        values, origin="lower", extent=(-extent, extent, -extent, extent), vmin=top - 40, vmax=top
-    )
+    drawn = axes.imshow(values, origin="lower", extent=ends, vmin=top - 40, vmax=top)
     axes.set(xlabel=labels[0], ylabel=labels[1])
     figure.colorbar(drawn, ax=axes, label="RCS [dBsm]")
     return figure

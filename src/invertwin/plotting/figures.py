@@ -99,8 +99,9 @@ def png_bytes(figure: Figure) -> bytes:
         if same_color(patch.get_facecolor()[:3], "white"):
             patch.set_facecolor("none")
     buffer = io.BytesIO()
-    # No time stamp: a run that is repeated writes the same bytes.
-    figure.savefig(buffer, format="png", dpi=110, facecolor="none", metadata={"Software": None})
+    # No time stamp: a run that is repeated writes the same bytes. No margins that axes left empty.
+    how: Any = {"metadata": {"Software": None}, "bbox_inches": "tight"}
+    figure.savefig(buffer, format="png", dpi=110, facecolor="none", **how)
     return buffer.getvalue()
 
 

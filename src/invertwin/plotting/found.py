@@ -36,7 +36,7 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         axes.scatter(*places[blind, ::-1].T, color="0.75", label="never seen", **style)
         figure.colorbar(dots, label="echoes, dB below bright ones", shrink=0.8)
     box = {"boxstyle": "round", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
-    for thing in twin.objects:
+    for number, thing in enumerate(twin.objects):
         x, y = thing.position[:2].tolist()
         at = y, x
         tint = color(0) if thing.existence_probability > 0.5 else "0.5"
@@ -46,7 +46,8 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
         spread = [thing.deviations.get(axis) for axis in "yx"]
         if None not in spread:
             width, height = (4 * float(value or 0.0) for value in spread)
-            axes.add_patch(Ellipse(at, width, height, fill=False, color=tint))
+            # Unlike a patch, it leaves the axes as they are: some deviations are of many metres.
+            axes.add_artist(Ellipse(at, width, height, fill=False, color=tint))
         if thing.track is not None:
             path = numbers(thing.track.positions)[:, [1, 0]]
             axes.plot(*path.T, color=tint, linewidth=1.0, marker=".", markersize=3)
@@ -55,7 +56,8 @@ def ground(twin: Twin, *, dynamic_range: float = 30.0) -> Figure:
             if math.hypot(ahead, left) > 0:
                 axes.annotate("", (y + left, x + ahead), at, arrowprops={"arrowstyle": "->"})
         text = f"{thing.name}: {thing.kind}"
-        axes.annotate(text, at, (14, 14), textcoords="offset points", fontsize=7, bbox=box)
+        side = 14 - 36 * (number % 2)  # names of neighbours are apart
+        axes.annotate(text, at, (14, side), textcoords="offset points", fontsize=7, bbox=box)
     if twin.image is not None and bool((twin.image.view_counts == 0).any()):
         axes.legend(fontsize=7, loc="upper right")
     return figure

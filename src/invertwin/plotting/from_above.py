@@ -57,8 +57,8 @@ def from_above(
         # As a map lies on the table of somebody at the radar: ahead is up, the left is left.
         axes.set(xlim=axes.get_xlim()[::-1], xlabel="y [m], to the left", facecolor="0.6")
     figure.set_figheight(figure.get_figheight() + 0.4)  # for the legend
-    handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=4, fontsize=8, facecolor="0.6")
+    handles, at = figure.axes[0].get_legend_handles_labels(), "outside lower center"
+    figure.legend(*handles, loc=at, ncols=4, fontsize=8, facecolor="0.3", labelcolor="white")
     return figure
 
 

@@ -245,7 +245,7 @@ def _crop_ranges(panels: list[tuple[Any, str, MapPanel]], dynamic_range: float) 
         kept |= power >= (power.max() * 10 ** (-dynamic_range / 10)).maximum(noise)
     rows = kept.nonzero()[:, 0].tolist() or [0, len(ranges)]
     shown = ranges[max(rows[0] - _RANGE_MARGIN, 0) : rows[-1] + 1 + _RANGE_MARGIN]
-    label = f"range [m], of {ranges[0]:.3g} to {ranges[-1]:.3g}"
+    label = f"range [m], cropped from {ranges[0]:.3g} to {ranges[-1]:.3g}"
     for cell, *_ in panels:
         cell.set_ylim(bin_edges(shown))
         if cell.get_subplotspec().is_first_col():

@@ -63,9 +63,8 @@ def placements(
     figure, (axes,) = row_of_axes(1, (8, 3.3))
     label = "best of the grid at this place"
     axes.plot(numbers(positions), numbers(levels), color=PALETTE[0], label=label)
-    axes.plot(
-        *numbers(search_ends).T, "o", color=PALETTE[1], label="found by gradient, phases fitted"
-    )
+    label = "found by gradient, phases fitted"
+    axes.plot(*numbers(search_ends).T, "o", color=PALETTE[1], label=label)
     axes.set(xlabel="place along the walls [m]", ylabel="worst receivers [dB]")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
@@ -88,7 +87,7 @@ def transmitter_fits(
     """
     figure, (axes,) = row_of_axes(1, (6.4, 4.6))
     plane = MapPlane.horizontal([0.0, 0.0], [1.0, 1.0], height, 1.0)
-    axes.add_collection(LineCollection(project_edges(scene, plane), colors="black", linewidths=1))
+    axes.add_collection(LineCollection(project_edges(scene, plane), colors="0.45", linewidths=1))
     ways = numbers(fits)[..., :2]
     axes.add_collection(LineCollection([*ways], colors="0.75", linewidths=0.8))
     axes.plot(*ways[:, 0].T, "o", color="0.6", markersize=4, label="starts")

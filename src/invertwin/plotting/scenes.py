@@ -71,9 +71,7 @@ def scene(
     width = 11.0
     height = 0.5 + sum(ratio * width / len(cells[0]) + 0.35 for ratio in ratios)
     figure = Figure(figsize=(width, height), layout="constrained")
-    grid = figure.subplots(
-        len(cells), len(cells[0]), squeeze=False, gridspec_kw={"height_ratios": ratios}
-    )
+    grid = figure.subplots(len(cells), len(cells[0]), squeeze=False, height_ratios=ratios)
     for axes, (k, title) in zip(grid.flat, (c for row in cells for c in row), strict=True):
         colors = _colors(drawn[title], highlight)
         _draw(axes, drawn[title], colors, edges, marks[k], views[k], windows[k])
@@ -173,9 +171,7 @@ def _draw(
         if np.ptp(vertices[:, plane], axis=0).max() < smallest:
             axes.plot(*vertices[:, plane].mean(axis=0), linestyle="", **mark)
     if positions is not None:
-        axes.plot(
-            *positions[:, plane].T, color="black", linestyle="", mew=0, **_draw_marks(positions)
-        )
+        axes.plot(*positions[:, plane].T, mew=0, **_draw_marks(positions))
     for set_limits, c in ((axes.set_xlim, 0), (axes.set_ylim, 1)):
         ends = window[c] + window[c + 2] / 2 * np.array([-1, 1])
         set_limits(*ends[:: view.signs[c]])
@@ -185,7 +181,8 @@ def _draw(
 
 def _draw_marks(positions: NDArray) -> dict[str, Any]:
     many = len(positions) > _TRACK_COUNT
-    return {"marker": ".", "markersize": 5} if many else {"marker": "v", "markersize": 4}
+    mark = {"marker": ".", "markersize": 5} if many else {"marker": "v", "markersize": 4}
+    return mark | {"color": "black", "linestyle": ""}
 
 
 def _legend(
@@ -193,14 +190,12 @@ def _legend(
 ) -> None:
     """Add the legend of colours above all scenes."""
     labels = {("other objects" if c == _BACKGROUND else name): c for name, c in names.items()}
-    handles: list[Patch | Line2D] = [
-        Patch(color=c, label=legible(name)) for name, c in labels.items()
-    ]
+    handles: list[Patch | Line2D] = [Patch(color=c, label=legible(k)) for k, c in labels.items()]
     if outlined:
         handles.append(Line2D([], [], color=_OUTLINE, linewidth=1, label="truth"))
     if positions is not None:
         label = f"radar, {len(positions)} positions" if len(positions) > 1 else "radar"
-        handles.append(Line2D([], [], color="black", ls="", label=label, **_draw_marks(positions)))
+        handles.append(Line2D([], [], label=label, **_draw_marks(positions)))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
 
 
@@ -224,9 +219,8 @@ def turntable(meshes: Mapping[str, Mesh], up: ArrayLike) -> bytes:
     for angle in np.arange(_FRAMES) * 2 * np.pi / _FRAMES:
         figure = Figure(figsize=(2.6 * len(shapes), 2.7), layout="constrained", dpi=72)
         eye = _eye(np.asarray(up, dtype=float), angle)
-        for axes, (title, (vertices, faces)) in zip(
-            figure.subplots(1, len(shapes), squeeze=False)[0], shapes.items(), strict=True
-        ):
+        row = figure.subplots(1, len(shapes), squeeze=False)[0]
+        for axes, (title, (vertices, faces)) in zip(row, shapes.items(), strict=True):
             paint(axes, [((vertices - center, faces), color(0))], eye, reach / 3)
             axes.set(title=title, xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
             axes.set_axis_off()

@@ -40,7 +40,7 @@ def paint(axes: Any, shapes: Sequence[tuple[Shape, str]], eye: NDArray, longest:
     order = np.argsort(triangles[:, :, 2].mean(axis=1))
     # Edges in the face's own colour close the hairlines between neighbouring triangles.
     drawn, tint = list(triangles[order][:, :, :2]), color[order]
-    axes.add_collection(PolyCollection(drawn, facecolors=tint, edgecolors=tint, linewidths=0.3))
+    axes.add_collection(PolyCollection(drawn, facecolors=tint, edgecolors=tint, linewidths=0.7))
 
 
 def small_triangles(triangles: NDArray, longest: float) -> NDArray:

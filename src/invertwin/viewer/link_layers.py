@@ -26,7 +26,8 @@ _BAND_LOOKS = {LEVELS: (POWER_COLORMAP, 0.8), PHASES: ("hsv", 1.0)}  # colours, 
 _CELL_SHARE = 0.9  # of a cell's side that is drawn, so that cells are apart
 _PANEL_SHARE = 0.1  # of the distance of transmitters: least side of a drawn metasurface
 _CORNERS = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]).double()  # of a cell
-_PATH_COLORS = ((40, 40, 40), (31, 119, 180), (44, 160, 44), (214, 39, 40), (148, 103, 189))
+# Apart from the colours of antennas, on white and on black.
+_PATH_COLORS = ((230, 159, 0), (0, 158, 115), (150, 100, 60), (214, 110, 170), (148, 103, 189))
 
 
 def link_layers(

@@ -37,22 +37,25 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     np.savetxt(table, rows, "%.9g", ",", header=heads, comments="")
     folder.write_bytes("map.csv", table.getvalue())
     best = values.amax(0).flatten()
-    tenth, median = best.quantile(torch.tensor([0.1, 0.5]).double()).tolist()
-    name = f"{model.quantity.replace('_', ' ').capitalize()} [{unit}]"
+    ends = best.quantile(torch.tensor([0.5, 0.1, 1.0]).double()).tolist()
+    median, tenth, largest = (f"{value:.3g} {unit}" for value in ends)
+    name = model.quantity.replace("_", " ").capitalize()
+    whose = " of the best transmitter" if len(values) > 1 else ""
     metrics: dict[str, Any] = {
         "task": "simulate",
-        "answer": f"{name} of the best transmitter at {len(best)} places: median {median:.4g}, a "
-        f"tenth is below {tenth:.4g}, the largest is {float(best.max()):.4g}",
-        "median": median,
-        "tenth": tenth,
-        "largest": float(best.max()),
+        "answer": f"{name}{whose} at {len(best)} places: median {median}, a tenth below {tenth}, "
+        f"largest {largest}",
+        **dict(zip(("median", "tenth", "largest"), ends, strict=True)),
         "wall_seconds": time.perf_counter() - begin,
     }
-    parts: list[Any] = [quantity_table(name, metrics, label_table="coverage")]
+    parts: list[Any] = [quantity_table(f"{name} [{unit}]", metrics, label_table="coverage")]
     if isinstance(places, MapPlane):
         maps = {f"transmitter {k}": one for k, one in enumerate(values, 1)}
-        figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, label=name)
-        parts.append(save_picture(folder, "coverage", figure, "Coverage"))
+        # Cells inside of objects would take most of the colours.
+        span = min(60.0, float(values.max() - values.quantile(0.01)))
+        look: Any = {"label": f"{name} [{unit}]", "dynamic_range": span}
+        figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, **look)
+        parts.insert(0, save_picture(folder, "coverage", figure, "Coverage"))
     title, status = run.title or "Coverage", f"{metrics['answer']}."
     tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
     return tables, metrics["answer"]

@@ -56,8 +56,8 @@ def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     view = plotting.scene(scene, radar, highlight=list(run.truth) or None)
     shown = ("spectra", "Spectra") if run.chirps is None else ("doppler", "First frame")
     parts = [
-        quantity_table("Simulation", metrics),
         save_picture(folder, "scene", view),
+        quantity_table("Simulation", metrics),
         save_picture(folder, shown[0], figure, shown[1], note),
     ]
     seen = radar if run.chirps is None else radar.frames([0])

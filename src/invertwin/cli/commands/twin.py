@@ -11,10 +11,11 @@ import torch
 from invertwin.capture import Capture, find_faults
 from invertwin.cli import report
 from invertwin.cli.commands.look import AnyRecording, read_recording, warning_tables
+from invertwin.cli.commands.view import load_display
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions
 from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
-from invertwin.cli.schema import build
+from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.constants import FRAME
 from invertwin.discovery import DetectedObject, Twin, average_chirps, twin
@@ -24,6 +25,7 @@ from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
 from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mesh
 from invertwin.storage.run_folder import RunFolder
+from invertwin.viewer import view_html
 
 _MIN_EXISTENCE_PROBABILITY = 0.5  # confidence of objects that are counted
 _MAX_DEVIATION = 0.5  # of their positions over the longest range: more is a place unknown
@@ -40,11 +42,12 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
     """
     begin = time.perf_counter()
     stated = ((name, getattr(arguments, name)) for name in _TWIN_OPTION_NAMES)
-    options = {name: value for name, value in stated if value is not None}
-    truth = None
+    options: dict[str, Any] = {name: value for name, value in stated if value is not None}
+    truth, title = None, arguments.recording.name
     if is_run_file(arguments.recording):
-        recording, truth, table = _load_run_file(arguments)
-        options = table | options
+        recording, truth, run = _load_run_file(arguments)
+        table = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
+        options, title = table | {"seed": run.seed} | options, run.title or title
     else:
         _, recording = read_recording(arguments)
     faults = [str(fault) for fault in find_faults(recording)]
@@ -78,14 +81,17 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
         folder.write_text("twin.toml", tomli_w.dumps(_describe_as_run(found, folder)))
     figure = pictures.ground(found)
     above = report.save_picture(folder, "ground", figure, "The ground from above", "ground")
-    parts = [_object_table(found), *warning_tables(faults), above, *_draw_maps(found, folder)]
+    parts: list[Any] = [_object_table(found), *warning_tables(faults), above]
+    parts += _draw_maps(found, folder)
     said = "; ".join((answer, *found.notes))
-    title = arguments.recording.name
     still = average_chirps(recording)
     if found.calibration is not None:
         found.calibration.save(folder.file("channels.json"))
         still = found.calibration.apply(still)
     still.save(folder.file("capture.nc"))
+    if scene is not None:
+        view = view_html(*load_display(folder.file("capture.nc").parent))
+        parts.insert(0, report.ReportView(view))
     if isinstance(recording, Capture):
         stated = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
         own = folder.path / "capture.nc"
@@ -95,19 +101,17 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
     return report.write_report(folder, metrics, title, f"{said}.", parts, again=again), answer
 
 
-def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, dict[str, Any]]:
-    """Load the data of a run file, their ground truth, and the settings of the search."""
+def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, RunFile]:
+    """Load the data of a run file, their ground truth, and the run file."""
     with prefix_file_errors(options.recording):
         run = load_run(options.recording)
-        given = {} if run.twin is None else run.twin.model_dump(exclude_none=True)
-        given["seed"] = run.seed
         data = require_section(run, "data", "a twin")
         if not isinstance(data, SimulatedData):
-            return data.build(), None, given
+            return data.build(), None, run
         radar = build.radar(require_section(run, "radar", "simulated data"))
         grid = build.grid(require_section(run, "grid", "simulated data"), radar)
         truth = build.true_scene(run)
-        return Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar), truth, given
+        return Capture.from_beat(simulate_exact(run, truth, radar, grid).beat, radar), truth, run
 
 
 def _state_objects(found: Twin) -> tuple[int, str]:
