@@ -172,6 +172,28 @@ def test_a_recording_is_legible_in_the_dark(watched, pictures, tmp_path, display
     assert watched.page.locator("h1").evaluate("x => getComputedStyle(x).color") == LIGHT
 
 
+def test_the_first_picture_has_ground_names_and_axes(watched, tmp_path, display, links):
+    opened(watched, page_html(display, links), tmp_path / "page.html")
+    page = watched.page
+    page.wait_for_timeout(1000)
+    words = "() => document.querySelector('[data-part=words]').toDataURL()"
+    scene, named = page.locator("#view canvas").first, page.evaluate(words)
+    first = np.asarray(image(scene.screenshot()).convert("L"), float)
+    # Nothing that is shown is cut off: the rim has the colour of the page.
+    for rim in (first[2:6], first[-6:-2], first[:, 2:6].T, first[:, -6:-2].T):
+        assert np.ptp(rim) < 3
+    page.get_by_role("checkbox", name="ground").click()
+    page.wait_for_timeout(300)
+    bare = np.asarray(image(scene.screenshot()).convert("L"), float)
+    assert (np.abs(first - bare) > 20).mean() > 0.003
+    assert page.evaluate(words) != named  # without its metres
+    shown = page.locator("[data-part=maps] span:visible")
+    assert {"30", "0", "-30", "-40", "2"} <= set(shown.all_inner_texts())
+    sizes = shown.evaluate_all("all => all.map((x) => parseFloat(getComputedStyle(x).fontSize))")
+    assert min(sizes) >= 11
+    assert watched.errors == []
+
+
 def test_a_report_is_legible_in_the_dark_and_on_paper(
     watched, pictures, tmp_path: Any, display, links
 ):

@@ -28,6 +28,8 @@ def test_help_names_the_commands(monkeypatch, capsys):
     said = capsys.readouterr().out
     for command in ("simulate", "reconstruct", "gradcheck", "demo", "doctor"):
         assert command in said
+    places = [said.index(f"─ {head} ─") for head in ("Begin", "Recordings", "Run files", "Develop")]
+    assert places == sorted(places)
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,9 @@ depth = 0
     assert metrics["median"] == pytest.approx(levels[len(levels) // 2], abs=0.05)
     said = " ".join(capsys.readouterr().out.split())
     assert metrics["answer"] in said
+    assert metrics["answer"].startswith(
+        f"Received power at 256 places: median {metrics['median']:.3g} dBm, a tenth below "
+    )
     assert (tmp_path / "out" / "coverage.png").exists()
 
 

@@ -1,6 +1,7 @@
 """`invertwin rcs`: run files of signatures."""
 
 import json
+import math
 import tomllib
 
 import pytest
@@ -42,6 +43,9 @@ def test_a_target_is_compared_and_drawn(tmp_path):
     run("rcs", tmp_path / "plate.toml", "-o", tmp_path / "out")
     found = metrics(tmp_path / "out")
     assert found["task"] == "rcs"
+    # Of a flat plate at the highest frequency.
+    most = 10 * math.log10(4 * math.pi * (0.05**2 / (299792458.0 / 31e9)) ** 2)
+    assert found["answer"] == f"plate: peak {most:.1f} dBsm"
     assert found["error_db"]["pattern"] < 0.05
     assert found["scenes"]["plate"]["error_db"] == found["error_db"]
     for name in ("plate.png", "plate_profile.png", "plate_image.png", "report.html", "plate.csv"):

@@ -92,7 +92,9 @@ def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
         file.name for file in folder.iterdir()
     }
     command = "twin capture.nc --low -1.0 -1.0 --high 1.0 1.0 --level 0.0 --rays 1200"
-    assert f"{command} --seed 2" in (folder / "report.html").read_text()
+    report = (folder / "report.html").read_text()
+    assert f"{command} --seed 2" in report
+    assert report.index('id="view-data"') < report.index("<h2>Objects</h2>")
     run = load_run(folder / "twin.toml")
     assert run.scene["object_1"].position == pytest.approx(thing["position_m"])
     # The capture that it wrote gives the same things again.

@@ -34,3 +34,16 @@ def test_the_ground_shows_things_movers_and_blind_places():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("y [m], to the left", "x [m]")
     left, right = axes.get_xlim()
     assert left > right
+
+
+def test_a_place_that_is_unknown_does_not_stretch_the_ground():
+    places = torch.cartesian_prod(*[torch.arange(3, dtype=torch.float64)] * 2)
+    picture = GroundImage(places, torch.ones(9, dtype=torch.float64), torch.ones(9).long())
+    at = torch.tensor([1.0, 1.0, 0.4], dtype=torch.float64)
+    lost = DetectedObject("object_1", "point", {"point": 1.0}, at, None, {"x": 20.0, "y": 20.0}, 1)
+    axes = found.ground(Twin((lost,), 0.0, picture)).axes[0]
+    (ellipse,) = axes.patches or axes.artists
+    assert ellipse.width == 80.0
+    for low, high in (sorted(axes.get_xlim()), axes.get_ylim()):
+        assert -1.0 < low < 0.0
+        assert 2.0 < high < 3.0

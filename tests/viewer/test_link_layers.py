@@ -32,6 +32,7 @@ def test_paths_begin_and_end_at_antennas_and_meet_the_floor_in_the_middle():
     receivers = ReceiverPoints(torch.tensor([[4.0, 0.0, 1.0]], dtype=torch.float64))
     found = layers_of(floor(PerfectConductor()), RadioMap(receivers, SETTINGS))
     assert list(found) == ["transmitters", "receivers", "paths: line of sight", "paths: reflection"]
+    assert len({layer.color for layer in found.values()}) == 4
     assert found["transmitters"].points == pytest.approx(np.array([[0.0, 0, 1]]))
     assert found["receivers"].points == pytest.approx(np.array([[4.0, 0, 1]]))
     direct = found["paths: line of sight"].points

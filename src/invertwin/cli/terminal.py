@@ -134,7 +134,7 @@ def run_each(
     files: Sequence[Path],
     command: str,
     runs: Mapping[str, Any],
-    work: Callable[..., list[ReportTable]],
+    work: Callable[..., tuple[list[ReportTable], str]],
 ) -> None:
     """Work on several run files with one report.
 
@@ -150,7 +150,7 @@ def run_each(
     def work_on(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with console.status("tracing") as status:
             say = status.update if console.is_terminal else limit_rate()
-            return work(RunBatch(runs, {file.stem: file for file in files}, folder), say), ""
+            return work(RunBatch(runs, {file.stem: file for file in files}, folder), say)
 
     run_in_folder(options, default, work_on, runs)
 

@@ -123,8 +123,7 @@ def reconstruction_html(found: Reconstruction) -> str:
     rows.append(("loss", f"{found.loss:.4g}"))
     known = vars(found)
     bars = known["uncertainty"].interval() if "uncertainty" in known else {}
-    if "verdict" in known:
-        rows.append(("verdict", known["verdict"].word))
+    rows += [("verdict", known["verdict"].word)] if "verdict" in known else []
     for name, value in found.history[-1]["values"].items():
         numbers = torch.as_tensor(value).reshape(-1)
         if len(numbers) <= 16:

@@ -200,7 +200,7 @@
     words.strokeStyle = light ? "#15181ccc" : "#ffffffcc";
     words.fillStyle = light ? "#e6e8eb" : "#1b1f24";
     words.font = `${13 * scale}px system-ui, sans-serif`;
-    for (const layer of named) put(layer.name.split("/").at(-1).slice(0, 24), add(layer.top, up, 0.03 * distance));
+    for (const layer of named) put(layer.name.slice(layer.name.indexOf("/") + 1).slice(0, 24), add(layer.top, up, 0.03 * distance));
     if (!ground.layer.shown) return;
     words.fillStyle = light ? "#a8afb9" : "#59616d";
     words.font = `${11 * scale}px system-ui, sans-serif`;

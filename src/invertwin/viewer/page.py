@@ -173,11 +173,10 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
     chosen = np.unique(np.linspace(0, len(display.steps) - 1, count).astype(int))
     kept = [display.steps[k] for k in chosen] if display.steps else []
     maps = collect_sensor_maps(replace(display, steps=kept), sensors or {})
-    low, high = display.box
     data = {
         "up": display.up,
         "ahead": display.ahead,
-        "box": [low.tolist(), high.tolist()],
+        "box": [corner.tolist() for corner in display.box],
         "layers": [
             # An ellipsoid is inside of its object, and seen through it.
             vars(layer)

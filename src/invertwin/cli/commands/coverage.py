@@ -40,11 +40,10 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     ends = best.quantile(torch.tensor([0.5, 0.1, 1.0]).double()).tolist()
     median, tenth, largest = (f"{value:.3g} {unit}" for value in ends)
     name = model.quantity.replace("_", " ").capitalize()
-    whose = " of the best transmitter" if len(values) > 1 else ""
     metrics: dict[str, Any] = {
         "task": "simulate",
-        "answer": f"{name}{whose} at {len(best)} places: median {median}, a tenth below {tenth}, "
-        f"largest {largest}",
+        "answer": f"{name}{' of the best transmitter' * (len(values) > 1)} at {len(best)} places: "
+        f"median {median}, a tenth below {tenth}, largest {largest}",
         **dict(zip(("median", "tenth", "largest"), ends, strict=True)),
         "wall_seconds": time.perf_counter() - begin,
     }

@@ -92,8 +92,8 @@ class GradcheckStudy(Protocol):
         ...
 
 
-def run_gradcheck(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
-    """Check every run file, write the folder, and return the tables to print."""
+def run_gradcheck(batch: RunBatch, say: Callable[[str], None]) -> tuple[list[ReportTable], str]:
+    """Check every run file, write the folder, return tables and a sentence."""
     begin, folder = time.perf_counter(), batch.folder
     scenes: dict[str, Any] = {}
     compared: dict[str, Any] = {}
@@ -123,7 +123,7 @@ def run_gradcheck(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTab
     table = ReportTable("Agreement with central differences", columns, rows, legend)
     status = "1 scene checked." if len(scenes) == 1 else f"{len(scenes)} scenes checked."
     parts = [table, *studies, *pictures]
-    return write_report(folder, metrics, "Gradient check", status, parts, again="gradcheck")
+    return write_report(folder, metrics, "Gradient check", status, parts, again="gradcheck"), status
 
 
 @dataclass(frozen=True)

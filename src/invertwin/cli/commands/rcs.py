@@ -31,8 +31,8 @@ _MeasuredRows = tuple[Tensor, Tensor, Tensor, tuple[int, int]]  # frequency, asp
 _Measured = Mapping[str, _MeasuredRows]  # by frequency and channel
 
 
-def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
-    """Compute every run file's signature, write the folder, and return the tables to print."""
+def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> tuple[list[ReportTable], str]:
+    """Compute every run file's signature, write the folder, return tables and a sentence."""
     begin, folder = time.perf_counter(), batch.folder
     scenes: dict[str, _RcsMetrics] = {}
     pictures: list[ReportPicture] = []
@@ -46,12 +46,14 @@ def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
         for file, title in found.pop("pictures").items():
             title = title if len(batch.runs) == 1 else f"{name}: {title}"
             pictures.append(ReportPicture(title, folder.file(f"{file}.png").read_bytes(), run.note))
-    metrics = {"task": "rcs", "scenes": scenes, "wall_seconds": time.perf_counter() - begin}
+    answer = "; ".join(f"{name}: peak {_peak(own):.1f} dBsm" for name, own in scenes.items())
+    seconds = time.perf_counter() - begin
+    metrics = {"task": "rcs", "answer": answer, "scenes": scenes, "wall_seconds": seconds}
     if len(scenes) == 1:
         metrics |= next(iter(scenes.values()))
     # Beside the scenes, so that every run file has a table of its own name.
     metrics |= {name: found for name, found in scenes.items() if name not in metrics}
-    status = ("1 target" if len(scenes) == 1 else f"{len(scenes)} targets") + " computed."
+    status = f"{answer}."
     skipped = [file for found in scenes.values() for file in found.get("skipped", ())]
     if skipped:
         missing = f"{len(skipped)} measured files are not there, such as {skipped[0]}"
@@ -59,7 +61,12 @@ def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> list[ReportTable]:
         warnings.warn(told, UserWarning, stacklevel=2)
         status += f" Skipped a comparison: {missing}."
     parts = [*_make_tables(scenes), *pictures]
-    return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs")
+    return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs"), answer
+
+
+def _peak(found: _RcsMetrics) -> float:
+    """Return the largest cross-section over all polarisations [dBsm]."""
+    return max((x for x in found["peak_dbsm"].values() if x is not None), default=float("-inf"))
 
 
 def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:

@@ -138,9 +138,8 @@ def _object_table(twin: Twin) -> report.ReportTable:
     heads += ["± [m]", "yaw [°]", "length, width, height [m]", "speed [m/s]"]
     rows: list[list[Any]] = []
     for thing in twin.objects:
-        figure = thing.shape
         size, yaw = None, None
-        if figure is not None:
+        if (figure := thing.shape) is not None:
             size = None if figure.kind == "corner" else [figure.length, figure.width, figure.height]
             yaw = math.degrees(figure.yaw) if figure.has_yaw else None
         rate = None if thing.velocity is None else float(thing.velocity.norm())
