@@ -60,15 +60,13 @@ def reconstruct_among_clutter(
     """
     is_single = isinstance(observations, inversion.Observation)
     given = [observations] if is_single else list(observations)
-    unknowns = name_unknowns(parameters)
+    unknowns, plain = name_unknowns(parameters), None
     if not always:
         plain = inversion.reconstruct(
             scene, given, copy.deepcopy(unknowns), schedule=schedule, seed=seed, **options
         )
         if not needs_clutter(plain):
             return plain
-        again: Any = {"schedule": schedule, "seed": seed, "callbacks": callbacks, **options}
-        return choose_result(plain, reconstruct_among_clutter(scene, given, unknowns, **again))
     own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
     stages = make_stages(schedule, [*unknowns, *(name for found in own for name in found)])
     if any(stage.frames_per_step is not None or stage.rebuilds_modules for stage in stages):
@@ -97,7 +95,8 @@ def reconstruct_among_clutter(
         unknowns = {
             name: replace(unknown, module=modules.pop(0)) for name, unknown in unknowns.items()
         }
-    return replace(found, doubts=_find_rivals(present, given, fitted, seed))
+    found = replace(found, doubts=_find_rivals(present, given, fitted, seed))
+    return found if plain is None else choose_result(plain, found)
 
 
 def _find_rivals(

@@ -115,33 +115,34 @@ def reconstruct(
         InputError: Nothing to fit, a map of zeros, an unknown name in a stage, a checkpoint of
             another fit.
     """
-    watched = [observations] if isinstance(observations, Observation) else list(observations)
-    if not watched:
+    observations = [observations] if isinstance(observations, Observation) else list(observations)
+    if not observations:
         raise InputError("expected at least one observation, got none; give Observation(...)")
     unknowns = name_unknowns(parameters)
-    own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(watched)]
-    stages = make_stages(schedule, [*unknowns, *(name for found in own for name in found)])
-    made = [_build_modules(o.sensor, found) for o, found in zip(watched, own, strict=True)]
-    sensor_modules = [found for found, _ in made]
-    penalties = [term for _, found in made for term in found]
+    groups = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(observations)]
+    named = dict(item for group in (unknowns, *groups) for item in group.items())
+    stages = make_stages(schedule, [*named])
+    built = [_build_modules(o.sensor, group) for o, group in zip(observations, groups, strict=True)]
+    sensor_modules = [group for group, _ in built]
+    penalties = [term for _, sensor_terms in built for term in sensor_terms]
     settings = FitSettings(loss, optimizer or Optimizer(), (*regularizers, *penalties), seed)
-    begun, fit, status = scene, None, "budget"
+    fit, status = None, "budget"
     history: list[dict[str, Any]] = []
-    modules, terms = _build_modules(begun, unknowns)
+    modules, terms = _build_modules(scene, unknowns)
     free = _FreeParameters([modules, *sensor_modules])
     for number, stage in enumerate(stages):
         if fit is not None and stage.rebuilds_modules:
-            begun, modules, terms = _rebuild_modules(fit.twin(), unknowns, stage)
+            scene, modules, terms = _rebuild_modules(fit.twin(), unknowns, stage)
             free = _FreeParameters([modules, *sensor_modules])
         free.apply(stage)
         fit = Fit(
-            begun,
-            _stage_observations(stage, watched),
+            scene,
+            _stage_observations(stage, observations),
             list(modules.values()),
-            [list(named.values()) for named in sensor_modules],
+            [list(group.values()) for group in sensor_modules],
             stage=stage,
             settings=replace(settings, regularizers=(*settings.regularizers, *terms)),
-            rates=free.learning_rates(dict(i for named in (unknowns, *own) for i in named.items())),
+            rates=free.learning_rates(named),
             stage_position=(number, len(history), number == len(stages) - 1),
         )
         status = fit.run(callbacks)
@@ -176,15 +177,16 @@ def prepare_fit(
         seed: seed of all random numbers.
     """
     modules, terms = _build_modules(scene, name_unknowns(parameters))
-    of_sensors = [_build_modules(o.sensor, name_unknowns(o.parameters)) for o in observations]
-    terms += [term for _, found in of_sensors for term in found]
-    own, others = list(modules.values()), [list(found.values()) for found, _ in of_sensors]
-    settings = FitSettings(loss, Optimizer(), (*regularizers, *terms), seed)
-    start: dict[str, Any] = {"stage": Stage(), "rates": {}, "stage_position": (0, 0, True)}
-    return Fit(scene, observations, own, others, settings=settings, **start)
+    built = [_build_modules(o.sensor, name_unknowns(o.parameters)) for o in observations]
+    terms += [term for _, sensor_terms in built for term in sensor_terms]
+    return Fit(
+        scene, observations, list(modules.values()), [list(group.values()) for group, _ in built],
+        stage=Stage(), settings=FitSettings(loss, Optimizer(), (*regularizers, *terms), seed),
+        rates={}, stage_position=(0, 0, True),
+    )  # fmt: skip
 
 
-def _stage_observations(stage: Stage, observations: list[Observation]) -> list[Observation]:
+def _stage_observations(stage: Stage, observations: Sequence[Observation]) -> Sequence[Observation]:
     """Return the observations with their forward models of a stage."""
     if not stage.models:
         return observations

@@ -131,8 +131,7 @@ def deposit_batch(
     if drawn > MAX_COUNT:
         raise InputError(
             f"expected at most {MAX_COUNT} samples of all scenes, got {drawn}; give fewer scenes "
-            f"or "
-            "samples at a time"
+            "or samples at a time"
         )
     with tracing(sampling.backend), torch_threads(1):
         geometry = _flatten_surfaces(Scene(objects), link, owners)
