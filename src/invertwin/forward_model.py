@@ -18,7 +18,7 @@ from invertwin.deprecation import read_renamed_attributes, rename_attributes, wa
 from invertwin.scene.scene import Scene
 
 Realisations = Callable[[int, float], Tensor]
-"""A map of a seed and of the mean noise in a bin: a recording that was simulated."""
+"""Function (seed, mean noise power per bin) → map of one simulated recording."""
 
 
 class ForwardModel(ABC):
@@ -29,9 +29,8 @@ class ForwardModel(ABC):
             whose random numbers belong to the scene.
         is_smooth: Whether the derivative of the mean is the mean of derivatives, visibility
             included. Gauss–Newton and gradient checks need that.
-        is_random: Whether maps depend on the seed. Of a model whose maps do not, gradient checks
-            take
-            one derivative and one pair of differences.
+        is_random: Whether maps depend on the seed. If they do not, gradient checks take one
+            derivative and one pair of differences.
         holds_fields: True if maps hold parts of fields or levels, of either sign, not power.
             They are compared by squares, not by the likelihood of speckle.
         needs_sensor: False for a model that predicts without a sensor.
@@ -60,9 +59,9 @@ class ForwardModel(ABC):
         """The map that the sensor would show.
 
         Args:
-            scene: What is seen.
-            sensor: What sees it, with its poses.
-            seed: Same seed, same map.
+            scene: Scene to predict.
+            sensor: Radar, camera or transmitters, with their poses.
+            seed: Seed of the random numbers; equal seeds give equal maps.
         """
 
     @abstractmethod
@@ -70,12 +69,12 @@ class ForwardModel(ABC):
         """A recording as a map of the same form."""
 
     def prepare(self, scene: Scene, sensor: Any, seed: int) -> "ForwardModel":
-        """The model with everything drawn that stays the same during a fit.
+        """The model with the random numbers drawn that stay the same during a fit.
 
         Args:
             scene: The scene at the start of the fit.
-            sensor: What sees it.
-            seed: Of what is drawn.
+            sensor: The sensor of the observation.
+            seed: Seed of these random numbers.
         """
         return self
 
@@ -98,13 +97,14 @@ class ForwardModel(ABC):
         The error bars of a fit and the test of its goodness draw from it.
 
         Args:
-            scene: What is seen.
-            sensor: What sees it.
-            seed: Of the points on rough surfaces.
+            scene: Scene to record.
+            sensor: The sensor of the observation.
+            seed: Seed of the points on rough surfaces.
 
         Returns:
-            A function of a seed and of the mean noise in a bin, of ``fields`` its mean square, that
-            returns a map, as ``observe`` would show it. None where the model cannot say.
+            A function (seed, mean noise power per bin) → map of the form of ``observe``; None if
+            the model cannot simulate recordings. With ``holds_fields``, the noise is the mean
+            square of a bin.
         """
         return None
 
@@ -113,7 +113,7 @@ class ForwardModel(ABC):
         return replace(self, sampling=replace(self.sampling, **changes))  # type: ignore
 
     def ablations(self) -> "dict[str, ForwardModel]":
-        """Models whose derivatives leave something out, by the field that says so.
+        """Models whose derivatives leave out one term, by the field of ``sampling`` that omits it.
 
         Gradient checks compare with them: ``boundary``, ``interior_edges``, ``contacts``.
         """
@@ -131,17 +131,17 @@ class ForwardModel(ABC):
         return False
 
     def scale_blur(self, fraction: float) -> "ForwardModel":
-        """The model with this share of its extra widths; 0 takes them away."""
+        """The model with its added blur widths times this fraction; 0 removes the blur."""
         return self
 
     def blur_observed(self, observed: Tensor, sensor: Any) -> Tensor:
-        """An observed map with the model's extra widths, of plain torch: no rays are traced here.
+        """An observed map with the model's added blur. It must not trace rays.
 
         A fit calls it in a thread of its own, while it predicts.
 
         Args:
             observed: From ``observe``.
-            sensor: What recorded it.
+            sensor: The sensor that recorded it.
         """
         return observed
 

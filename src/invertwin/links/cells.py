@@ -79,11 +79,11 @@ class Cells(ReceiverLocations):
         return replace(self, sampling=sampling)  # type: ignore[type-var]
 
     def with_sample_count(self, samples: int) -> "Cells":
-        """The same cells with so many points in all. See ``Places.finer``."""
+        """The same cells with so many points in all. See ``ReceiverLocations``."""
         return self.with_sampling(replace(self.sampling, points=max(1, samples // len(self.areas))))
 
     def fixed_visibility(self) -> "Cells | None":
-        """The same cells without boundary paths. See ``Places.fixed_visibility``."""
+        """The same cells without boundary paths. See ``ReceiverLocations``."""
         if not self.sampling.boundary:
             return None
         return self.with_sampling(replace(self.sampling, boundary=False))
@@ -117,7 +117,7 @@ class Cells(ReceiverLocations):
     def link_statistics(
         self, scene: Scene, sensor: Transmitters, propagation: PropagationSettings, seed: int
     ) -> LinkStatistics:
-        """Means over the cells. See ``Places.received``.
+        """Means over the cells. See ``ReceiverLocations``.
 
         The delay spread of a cell is that of the powers over excess delays: those of paths less
         that of the straight line to the same point.

@@ -19,7 +19,7 @@ from invertwin.scene.material.fresnel import LEAST_COSINE
 
 _Axes = Float64[Tensor, "row 2 3"]
 Waves: TypeAlias = Complex128[Tensor, "row 2 3"]
-Vectors = Float64[Tensor, "*row 3"]
+Vectors = Float64[Tensor, "*row 3"]  # of any leading shape
 
 
 class SmoothInterfaces(NamedTuple):

@@ -257,8 +257,8 @@ def _interior_silhouette_paths(
     choices = opaque(depth - 1)
     count = 1 + (samples.index // 2) % choices
     ends_at_receiver = (samples.index % 2) == 1
-    kept = dr.exp(-medium.attenuation * distance)
-    throughput = fixed.scale * mi.Float(choices) * kept / dr.square(distance)
+    attenuation = dr.exp(-medium.attenuation * distance)
+    throughput = fixed.scale * mi.Float(choices) * attenuation / dr.square(distance)
     distance = medium.refractive_index * distance
     zero = dr.zeros(mi.Float, samples.size)
     first = walk.initial_state(samples.index, samples.frame, source, -to_behind, throughput, zero)

@@ -243,7 +243,7 @@ class _Deposit(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """Linear map of plain tensors, applied one by one for the batches of ``torch.func``."""
+    """Linear function of tensors; ``vmap`` calls it once for each entry of a batch."""
 
     @staticmethod
     def forward(act: Callable[..., Any], *values: Tensor) -> Any:
@@ -274,15 +274,15 @@ class _Linear(torch.autograd.Function):
 
 
 def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
-    """Pull the gradient of the map back to some tables."""
+    """Pull the gradient of the map back to some tables (vector–Jacobian product)."""
     trace: power_trace.PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         tables = _attach_tables(trace, names)
         inputs = trace.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
-        seed = ctx.layout.expand_to_strips(grad)
+        strip_gradient = ctx.layout.expand_to_strips(grad)
 
         def gather(*path: Any) -> bins.FourFloats:
-            return bins.gather_adjoint(seed, ctx.layout, *path)
+            return bins.gather_adjoint(strip_gradient, ctx.layout, *path)
 
         boundary = trace.trace_boundary(inputs)
         for records in [trace.last_records] if trace.last_records else trace.iterate_records():
@@ -299,7 +299,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
 
 
 def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
-    """Push tangents of some tables forward to the map."""
+    """Push tangents of some tables forward to the map (Jacobian–vector product)."""
     trace: power_trace.PowerTracer = ctx.trace
     with tracing(ctx.backend), torch_threads(1):
         given = dict(zip(names, tangents, strict=True))

@@ -138,17 +138,18 @@ class IntersectionCurveSampler:
         origin = _offset_into_wedge(interactions[0], normals, incident).position
         transmission = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
         exists = transmission.transmittance > 0
-        odds, source = mi.Float(1.0), SurfacePoint(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
+        source = SurfacePoint(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
+        hit_probability = mi.Float(1.0)
         if deep:
             ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(incident)), (index, self.seeds[2])
             hit = trace_to_surface(rays, inputs, ray, valid & (count > 0), key, coherent=False)
             exists |= hit.valid & rays.is_in_scene(frame, hit.point.face, hit.valid)
-            odds, source = hit.probability, hit.point
+            hit_probability, source = hit.probability, hit.point
             transmission = dr.select(count > 0, hit.transmission, transmission)
         edge = dr.gather(mi.UInt32, self.resting, entry % self.segments)
         rests, edge = edge > 0, dr.maximum(edge, 1) - 1
         exists &= ~rests | self._is_facing(edge, points[0].face, (x, offset), normals, incident)
-        weight = dr.norm(offset) / (probability * self.size * odds)
+        weight = dr.norm(offset) / (probability * self.size * hit_probability)
         weight *= dr.select(rests, 0.5, 1.0)  # the other half is that of `trace_past_edge`
         samples = IntersectionPoint(
             index, frame, weight, transmission, points[0], points[1], source
@@ -240,10 +241,10 @@ class _IncidentSubpath:
             source, deep = integrand.compute_interaction(fixed, points.source, count > 0), count > 0
             way, step = integrand.direction_and_distance(here.position, source.position)
             medium = integrand.find_medium(fixed, here, source, way, deep)
-            odds = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
-            kept = dr.select(deep & (odds > 0), dr.exp(-medium.attenuation * step) / odds, 0.0)
+            pdf = dr.abs(dr.dot(source.normal, way)) / (4 * dr.pi)
+            factor = dr.select(deep & (pdf > 0), dr.exp(-medium.attenuation * step) / pdf, 0.0)
             reach = medium.refractive_index * step + added
-            first = walk.initial_state(index, frame, points.source, -way, kept, reach)
+            first = walk.initial_state(index, frame, points.source, -way, factor, reach)
             done = walker.trace_subpath(first, count, at_receiver)
             incident = dr.select(deep, way, incident)
             throughput = dr.select(deep, done["power"], throughput)

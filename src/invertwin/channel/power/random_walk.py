@@ -275,12 +275,12 @@ class RandomWalk:
         medium = integrand.find_medium(self.inputs, point, found, -to_point, active)
         density = direction_sampler.density(point, sample, hit.point.face, active, scene)
         active &= density > 0
-        odds = density * survival * cosine * hit.probability
+        probability = density * survival * cosine * hit.probability
         weight = scattered * hit.transmission.transmittance
-        weight = weight * dr.exp(-medium.attenuation * distance) / odds
+        weight = weight * dr.exp(-medium.attenuation * distance) / probability
         state["throughput"] = dr.select(active, state["throughput"] * weight, 0.0)
         if "weight" in state:
-            state["weight"] = state["weight"] * dr.square(distance) / odds
+            state["weight"] = state["weight"] * dr.square(distance) / probability
         state["face"], state["b1"], state["b2"] = hit.point.face, hit.point.b1, hit.point.b2
         state["interaction"] = found.detach()
         state["incident"] = mi.Vector3f(to_point)

@@ -168,16 +168,17 @@ def _evaluate_vertex(
 
     before = locate_previous(lambda: neighbours.previous_interaction)
     incident, distance = integrand.direction_and_distance(here.position, before)
-    optical, loss = distance, mi.Float(1.0)
+    optical, attenuation = distance, mi.Float(1.0)
     if inputs.surfaces.has_refracting_bodies and neighbours.previous_interaction is not None:
         medium = integrand.find_medium(
             inputs, here, neighbours.previous_interaction, incident, inner
         )
-        optical, loss = distance * medium.refractive_index, dr.exp(-medium.attenuation * distance)
+        optical = distance * medium.refractive_index
+        attenuation = dr.exp(-medium.attenuation * distance)
     first = active if single else active & (number == 0)
     departure = integrand.project_to_axes(antennas(False, first).axes, -incident)
     gain = dr.select(first, inputs.gain(frame, False, departure), 1.0)
-    arriving = gain * here.jacobian * loss / dr.square(distance)
+    arriving = gain * here.jacobian * attenuation / dr.square(distance)
     receiver = antennas(True, active)
     connection = integrand.connect_antenna(
         inputs, frame, here, incident, True, active,
@@ -360,7 +361,7 @@ def pull(
     records: PathRecords,
     gather: Callable[[PathContribution, mit.Bool], FourFloats],
 ) -> None:
-    """Reverse mode: add to the gradients of the attached inputs.
+    """Reverse mode (vector–Jacobian product): add to the gradients of the attached inputs.
 
     Args:
         rays: ray scene.
@@ -446,7 +447,7 @@ def push(
     records: PathRecords,
     scatter: Callable[[PathContribution, FourFloats, mit.Bool], None],
 ) -> None:
-    """Forward mode: scatter every path with the tangents of its power, range, u and v.
+    """Forward mode (Jacobian–vector product): scatter every path with its tangents.
 
     Args:
         rays: ray scene.

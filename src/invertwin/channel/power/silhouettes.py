@@ -356,8 +356,8 @@ def trace_past_edge(
     )
     touches &= hit.point.face == touched
     # Motion that opens a gap and motion that closes it have two slopes: half of each counts.
-    odds = dr.select(touches & rests, 2.0, 1.0) * hit.probability
-    return replace(hit, valid=hit.valid & ~(touches & crossed), probability=odds)
+    probability = dr.select(touches & rests, 2.0, 1.0) * hit.probability
+    return replace(hit, valid=hit.valid & ~(touches & crossed), probability=probability)
 
 
 def _is_beside(rays: RayScene, edge: mit.UInt32, face: mit.UInt32) -> mit.Bool:

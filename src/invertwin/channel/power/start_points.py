@@ -64,10 +64,7 @@ class RaySampler:
         self.rows = max(1, int(np.sqrt(samples / blocks)))
         self.columns = max(1, samples // blocks // self.rows)
         self.size = blocks * self.rows * self.columns
-        self.seed, self.transmission_seed = (
-            arrays.scramble_seed(seed, 0),
-            arrays.scramble_seed(seed, 8),
-        )
+        self.seed, self.transmission_seed = (arrays.scramble_seed(seed, k) for k in (0, 8))
 
     def draw(self, index: mit.UInt32, inputs: Inputs) -> StartPoints:
         """Draw the samples of given numbers.

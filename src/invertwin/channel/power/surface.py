@@ -1,4 +1,4 @@
-"""Scattering laws in Dr.Jit: tables of ``scene.material.Surface``, and their evaluation.
+"""Scattering laws in Dr.Jit: tables of ``scene.ScatteringLaw``, and their evaluation.
 
 Values carry derivatives if the tables do. The same law in torch, float64, is
 ``channel/coherent/radar_equation.py``; tests hold the two equal.
@@ -26,7 +26,7 @@ _CONSTANT_COLUMNS = ("diffuse", "lobes", "exponents", "index", "attenuation")
 
 @dataclass(frozen=True)
 class ScatteringLawTables:
-    """Rows of ``scene.material.Surface`` as flat Dr.Jit arrays, and properties of all rows.
+    """Rows of ``scene.ScatteringLaw`` as flat Dr.Jit arrays, and properties of all rows.
 
     Attributes:
         tables: tables by the names of ``SCATTERING_TABLES``.

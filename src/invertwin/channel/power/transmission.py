@@ -1,7 +1,7 @@
 """Transmission of path segments: clear, attenuated by sheets, or blocked.
 
 A sheet (a slab meshed as one surface) transmits straight on: the power is multiplied by its
-transmittance, and the optical length grows by its extra length (``scene.material.Surface``). Any
+transmittance, and the optical length grows by its extra length (``scene.ScatteringLaw``). Any
 number of sheets may follow one another.
 """
 
@@ -240,8 +240,8 @@ def trace_to_surface(
         state["valid"] = state["valid"] | ends
         passed = state["transmission"].then(sheet)
         state["transmission"] = dr.select(passes, passed, state["transmission"])
-        odds = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
-        state["probability"] = state["probability"] * odds
+        decision = dr.select(passes, probability, dr.select(ends, 1 - probability, 1.0))
+        state["probability"] = state["probability"] * decision
         step = RAY_EPSILON * (hit.t + dr.norm(place))
         state["origin"] = dr.select(passes, place + ray.d * step, origin)
         state["count"] = state["count"] + 1

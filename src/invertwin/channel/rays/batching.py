@@ -20,8 +20,8 @@ def arrange_scenes(
     """Move every scene, with radar poses of its own, into a box of its own.
 
     A segment between two points of a box stays in it. So no scene hides anything in another one,
-    and what a ray meets after it has left its box counts as nothing (``RayScene.in_scene``): paths
-    are those of the scenes one by one. Derivatives pass, since the moves are constants.
+    and surfaces that a ray meets beyond its box do not count (``RayScene.is_in_scene``): paths are
+    those of the scenes one by one. Derivatives pass, since the moves are constants.
 
     Args:
         geometry: The objects of all scenes, where they are in their own one.

@@ -46,8 +46,8 @@ class Topology:
     ) -> None:
         self.face_object = face_object = vertex_object[faces[:, 0]]
         self.object_group = torch.from_numpy(groups)
-        self.fallback_face: int | None = None  # a triangle that was no sliver when last looked at
-        #: Objects in one place, when last looked at, and for which pairs, antennas and vertices.
+        self.fallback_face: int | None = None  # a triangle that was no sliver at the last test
+        #: Coplanar objects at the last test, and the pairs, antennas and vertices of that test.
         self.coplanar_cache: tuple[set[tuple[int, int]], Tensor, Tensor, Tensor] | None = None
         self.vertex_object = owner = vertex_object
         used = torch.bincount(faces.ravel()).nonzero()[:, 0]
@@ -79,7 +79,7 @@ class Topology:
         self.panels = self.open_objects - set(face_object[beside[beside[:, 1] < 0, 0]].tolist())
         self.faces = faces = _turn_outwards(faces, welded, face_object, places, self.open_objects)
         self.device_faces = to_index(faces)
-        #: The same, four numbers each, the last one zero: each is read as a whole.
+        #: The same, padded to four numbers per triangle, so that one read gathers a triangle.
         self.device_corners = to_index(torch.nn.functional.pad(faces, (0, 1)))
         self.device_face_object = to_index(face_object)
         self.device_edges = [to_index(self.edges[:, k]) for k in range(2)]
@@ -141,7 +141,7 @@ class Topology:
 
     @cached_property
     def device_welded_faces(self) -> mit.UInt32:
-        """``welded`` as a flat array of the ray tracer."""
+        """``welded_faces`` as a flat array of the ray tracer."""
         return to_index(self.welded_faces)
 
     @cached_property

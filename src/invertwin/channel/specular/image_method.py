@@ -30,7 +30,7 @@ from invertwin.channel.rows import Rows
 
 _StepNumbers = Int64[Tensor, "row step"]
 _StepVectors = Float64[Tensor, "row step 3"]
-Vectors: TypeAlias = Float64[Tensor, "row 3"]
+PathVectors: TypeAlias = Float64[Tensor, "row 3"]  # one for each path
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
 DIRECT = torch.zeros(1, 0, dtype=torch.int64)
 """The sequence without steps, of the line of sight."""
@@ -78,7 +78,7 @@ class CandidateSurfaces(Occluders):
         height = area / sides.norm(dim=2).amax(1).clamp_min(1e-300)
         return arrays.to_float(self.margin / height.clamp_min(1e-300))
 
-    def images(self, positions: Vectors, steps: _StepNumbers) -> list[Vectors]:
+    def images(self, positions: PathVectors, steps: _StepNumbers) -> list[PathVectors]:
         """Images of positions after each step of sequences, relative to the local origin [m].
 
         Args:
@@ -110,11 +110,11 @@ class SpecularPaths(Rows):
 
 
 def image_positions(
-    position: Vectors,
+    position: PathVectors,
     point: _StepVectors,
     normal: _StepVectors,
     transmitted: Bool[Tensor, "row step"],
-) -> list[Vectors]:
+) -> list[PathVectors]:
     """Positions of a source and of its images after each step.
 
     Args:
@@ -140,8 +140,8 @@ def replace_zeros(values: Tensor) -> Tensor:
 
 
 def interaction_points(
-    target: Vectors, images: list[Vectors], point: _StepVectors, normal: _StepVectors
-) -> list[Vectors]:
+    target: PathVectors, images: list[PathVectors], point: _StepVectors, normal: _StepVectors
+) -> list[PathVectors]:
     """Intersection points of paths with the planes, from the source on.
 
     Args:
@@ -176,7 +176,7 @@ class UnfoldedPaths:
         topology: Topology,
         faces: _StepNumbers,
         transmitted: Bool[Tensor, "row step"],
-        source: Vectors,
+        source: PathVectors,
     ) -> None:
         corners = vertices[topology.faces[faces]]
         self.faces, self.transmitted = faces, transmitted
@@ -184,11 +184,11 @@ class UnfoldedPaths:
         self.images = image_positions(source, self.point, self.normal, transmitted)
 
     @property
-    def image(self) -> Vectors:
+    def image(self) -> PathVectors:
         """Image of the source in all surfaces [m]."""
         return self.images[-1]
 
-    def interaction_points(self, target: Vectors) -> Tensor:
+    def interaction_points(self, target: PathVectors) -> Tensor:
         """Interaction points of the paths to targets, [row, step, 3] [m].
 
         Args:
@@ -197,7 +197,7 @@ class UnfoldedPaths:
         found = interaction_points(target, self.images, self.point, self.normal)
         return torch.stack(found, 1) if found else self.point
 
-    def directions(self, target: Vectors) -> list[Vectors]:
+    def directions(self, target: PathVectors) -> list[PathVectors]:
         """Unit vectors of the legs to targets, from the source on.
 
         Args:
@@ -387,7 +387,7 @@ class _SpecularSegments(Rows):
 
 
 def intersects_planes(
-    surfaces: CandidateSurfaces, steps: _StepNumbers, images: list[Vectors], target: Vectors
+    surfaces: CandidateSurfaces, steps: _StepNumbers, images: list[PathVectors], target: PathVectors
 ) -> Bool[Tensor, " row"]:
     """Test if lines to the images intersect the planes within their rectangles, in order.
 
@@ -416,8 +416,8 @@ def intersects_planes(
 def find_unobstructed_paths(
     surfaces: CandidateSurfaces,
     steps: _StepNumbers,
-    source: Vectors,
-    targets: Vectors,
+    source: PathVectors,
+    targets: PathVectors,
     target_planes: Int64[Tensor, " row"] | None = None,
 ) -> tuple[Bool[Tensor, " row"], _StepNumbers]:
     """Find unobstructed paths along given planes, and the triangles of their interactions.
@@ -448,7 +448,7 @@ def find_unobstructed_paths(
 
 
 def is_unobstructed(
-    surfaces: CandidateSurfaces, start: Vectors, end: Vectors
+    surfaces: CandidateSurfaces, start: PathVectors, end: PathVectors
 ) -> Bool[Tensor, " row"]:
     """Mask of unobstructed straight lines.
 
