@@ -48,11 +48,11 @@ REQUIRED: Required = {
     "mixed": ("<=", 0),
 }
 COUNTED = {
-    "lost": "cases with something lost, or that did not go on",
-    "largest_difference": "from runs that were not killed [m, or relative]",
-    "kills": "cases killed before their end",
-    "mixed": "pairs that mixed their results",
-    "pairs": "pairs in one folder at once",
+    "lost": (".3g", "cases with something lost, or that did not go on"),
+    "largest_difference": (".3g", "from runs that were not killed [m, or relative]"),
+    "kills": (".3g", "cases killed before their end"),
+    "mixed": (".3g", "pairs that mixed their results"),
+    "pairs": (".3g", "pairs in one folder at once"),
 }
 RUN = """
 task = "reconstruct"
@@ -306,8 +306,7 @@ def main() -> None:
     os.environ |= {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     metrics = measure(given.kills, given.pairs, given.seed)
     table = MetricTable("Crash safety", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
 
 

@@ -45,17 +45,17 @@ REQUIRED: Required = {
     **{f"bytes_equal.{name}": (">=", 1) for name in CASES},
 }
 COUNTED = {
-    "samples_per_second.workers_1": "samples a second, one worker",
-    "samples_per_second.workers_2": "samples a second, two workers",
-    "scaling": "two workers over one",
-    "cpu_seconds.workers_1": "processor time a sample [s], one worker",
-    "cpu_seconds.workers_2": "processor time a sample [s], two workers",
-    "bytes_equal.workers_2": "1 = all shards have the bytes of one worker: two workers",
-    "bytes_equal.parts_2": "the same, two parts",
-    "bytes_equal.parts_5": "the same, five parts",
-    "bytes_equal.killed": "the same, killed and resumed",
-    "bytes_equal.ray": "the same, two nodes of a Ray cluster",
-    "kills": "runs that were killed before their end",
+    "samples_per_second.workers_1": (".3g", "samples a second, one worker"),
+    "samples_per_second.workers_2": (".3g", "samples a second, two workers"),
+    "scaling": (".3g", "two workers over one"),
+    "cpu_seconds.workers_1": (".3g", "processor time a sample [s], one worker"),
+    "cpu_seconds.workers_2": (".3g", "processor time a sample [s], two workers"),
+    "bytes_equal.workers_2": (".3g", "1 = all shards have the bytes of one worker: two workers"),
+    "bytes_equal.parts_2": (".3g", "the same, two parts"),
+    "bytes_equal.parts_5": (".3g", "the same, five parts"),
+    "bytes_equal.killed": (".3g", "the same, killed and resumed"),
+    "bytes_equal.ray": (".3g", "the same, two nodes of a Ray cluster"),
+    "kills": (".3g", "runs that were killed before their end"),
 }
 
 
@@ -211,9 +211,7 @@ def main() -> None:
     text = ROOMS.read_text().replace("samples = 200", f"samples = {given.samples}")
     metrics = measure(text, given.kills, given.repeats, given.seed)
     table, numbers = MetricTable("Data sets", REQUIRED), flat(metrics)
-    for key, words in COUNTED.items():
-        if key in numbers:
-            table.row(key, numbers[key], ".3g", words)
+    table.rows(numbers, {key: row for key, row in COUNTED.items() if key in numbers})
     if "bytes_equal.ray" not in numbers:
         print("ray is not installed: no cluster was tried (pip install 'invertwin[ray]')")
     write(metrics, table.grid, given.out)

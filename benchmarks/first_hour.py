@@ -40,11 +40,11 @@ REQUIRED: Required = {
     "twin_error_m": ("<=", 0.15),
 }
 COUNTED = {
-    "failed_steps": "steps whose output is not what it should be",
-    "processor_seconds": "of all steps [s]",
-    "headline_over_bar": "largest error of the fit's sentence over its 95 % bar",
-    "look_error_m": "of the range of the crate in its raw files [m]",
-    "twin_error_m": "between a box and the nearest thing found [m]",
+    "failed_steps": (".3g", "steps whose output is not what it should be"),
+    "processor_seconds": (".3g", "of all steps [s]"),
+    "headline_over_bar": (".3g", "largest error of the fit's sentence over its 95 % bar"),
+    "look_error_m": (".3g", "of the range of the crate in its raw files [m]"),
+    "twin_error_m": (".3g", "between a box and the nearest thing found [m]"),
 }
 SIDES = (0.3, 0.5, 0.4)  # of the crate [m]
 BOARD = 'board = { name = "IWR6843ISK", elevation = 1 }'
@@ -257,8 +257,7 @@ def main() -> None:
     given = parser.parse_args()
     metrics = measure(given.steps)
     table = MetricTable("The first hour", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
 
 

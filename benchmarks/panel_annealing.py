@@ -34,9 +34,9 @@ from invertwin.seeds import derive_seed
 AS_GOOD = 0.95
 REQUIRED: Required = {"evaluations_ratio": ("<=", 1.0)}
 COUNTED = {
-    "annealing_over_exhaustive": "worst receivers, over the best of the grid",
-    "evaluations_ratio": "evaluations of the fit, over those of annealing",
-    "annealing_reached": "starts from which annealing got as far",
+    "annealing_over_exhaustive": (".3g", "worst receivers, over the best of the grid"),
+    "evaluations_ratio": (".3g", "evaluations of the fit, over those of annealing"),
+    "annealing_reached": (".3g", "starts from which annealing got as far"),
 }
 
 
@@ -158,8 +158,7 @@ def main() -> None:
     fits = json.loads((given.run / "metrics.json").read_text(encoding="utf-8"))
     metrics = compare(problem, fits, given.starts, given.times)
     table = MetricTable("Annealing of a metasurface", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
 
 

@@ -40,10 +40,10 @@ REQUIRED: Required = {
     "largest_gb": ("<=", GIGABYTES),
 }
 COUNTED = {
-    "cases": "attacks, each a process in a folder of its own",
-    "failures": "not one line, over the limits, or something lost",
-    "slowest_seconds": "processor time of a refusal",
-    "largest_gb": "peak memory of a refusal",
+    "cases": (".3g", "attacks, each a process in a folder of its own"),
+    "failures": (".3g", "not one line, over the limits, or something lost"),
+    "slowest_seconds": (".3g", "processor time of a refusal"),
+    "largest_gb": (".3g", "peak memory of a refusal"),
 }
 #: As the console script begins: its own folder is on the import path, not the working one.
 LAUNCHER = """import sys
@@ -183,8 +183,7 @@ def main() -> None:
     given = parser.parse_args()
     metrics = measure(given.only, lambda line: print(line, flush=True))
     table = MetricTable("Siege", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
     sys.exit(bool(metrics["failures"]))
 

@@ -48,13 +48,13 @@ REQUIRED: Required = {
     "busy_ratio": ("<=", 6.0),
 }
 COUNTED = {
-    "version_seconds": "processor time of invertwin --version [s]",
-    "refusal_seconds": "the most of all commands that are refused [s]",
-    "idle_seconds": "the demo alone [s]",
-    "busy_seconds": "the demo beside the load [s]",
-    "busy_ratio": "of the two",
-    "idle_processor_seconds": "processor time of the demo alone [s]",
-    "busy_processor_seconds": "and beside the load [s]",
+    "version_seconds": (".3g", "processor time of invertwin --version [s]"),
+    "refusal_seconds": (".3g", "the most of all commands that are refused [s]"),
+    "idle_seconds": (".3g", "the demo alone [s]"),
+    "busy_seconds": (".3g", "the demo beside the load [s]"),
+    "busy_ratio": (".3g", "of the two"),
+    "idle_processor_seconds": (".3g", "processor time of the demo alone [s]"),
+    "busy_processor_seconds": (".3g", "and beside the load [s]"),
 }
 
 
@@ -188,8 +188,7 @@ def main() -> None:
     given = parser.parse_args()
     metrics = measure(given.steps, given.load)
     table = MetricTable("Starting, and a busy machine", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
 
 

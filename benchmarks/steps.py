@@ -52,13 +52,13 @@ STEPS, SKIPPED = 30, 5
 CONVOLUTIONS = ("mm", "einsum", "fft", "conv")
 REQUIRED: Required = {"step_over_kernels": ("<=", 2.0)}
 COUNTED = {
-    "step": "one step of the fit",
-    "kernels": "Dr.Jit kernels",
-    "convolutions": "matrix products and FFTs of torch",
-    "torch": "other torch operations",
-    "rest": "Python, tracing, waiting",
-    "kernel_count": "launches a step",
-    "step_over_kernels": "",
+    "step": (".4f", "one step of the fit"),
+    "kernels": (".4f", "Dr.Jit kernels"),
+    "convolutions": (".4f", "matrix products and FFTs of torch"),
+    "torch": (".4f", "other torch operations"),
+    "rest": (".4f", "Python, tracing, waiting"),
+    "kernel_count": (".0f", "launches a step"),
+    "step_over_kernels": (".4f", ""),
 }
 
 
@@ -139,8 +139,7 @@ def measure(steps: int = STEPS, skipped: int = SKIPPED) -> dict[str, Any]:
 def table(metrics: dict[str, Any]) -> MetricTable:
     """A row a metric."""
     shown = MetricTable("One step of the demo's fit [s]", REQUIRED)
-    for key, text in COUNTED.items():
-        shown.row(key, metrics[key], ".0f" if key == "kernel_count" else ".4f", text)
+    shown.rows(metrics, COUNTED)
     return shown
 
 

@@ -41,10 +41,10 @@ FITS = (
 )
 REQUIRED: Required = {"largest_difference": ("<=", 1e-6), "aborts": ("<=", 0)}
 COUNTED = {
-    "largest_difference": "between threads and one after the other [m]",
-    "serial_difference": "between the same fits in one thread [m]",
-    "aborts": "repetitions without numbers",
-    "fits": "fits in threads",
+    "largest_difference": (".3g", "between threads and one after the other [m]"),
+    "serial_difference": (".3g", "between the same fits in one thread [m]"),
+    "aborts": (".3g", "repetitions without numbers"),
+    "fits": (".3g", "fits in threads"),
 }
 
 
@@ -123,8 +123,7 @@ def main() -> None:
         return
     metrics = measure(given.repetitions, given.steps)
     table = MetricTable("Fits in threads", REQUIRED)
-    for key, text in COUNTED.items():
-        table.row(key, metrics[key], ".3g", text)
+    table.rows(metrics, COUNTED)
     write(metrics, table.grid, given.out)
 
 
