@@ -87,8 +87,8 @@ class ShapeSearch:
         Args:
             shapes: candidate shapes.
         """
-        one, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
-        return one.total_gain(shapes) - 0.5 * count * math.log(one.independent_draws)
+        likelihood, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
+        return likelihood.total_gain(shapes) - 0.5 * count * math.log(likelihood.independent_draws)
 
     def is_better(self, new: Shapes, old: Shapes) -> bool:
         """Return whether new shapes are preferred to old ones.
@@ -114,11 +114,10 @@ class ShapeSearch:
         Args:
             shapes: known shapes.
         """
-        one = self.fitted_frames
-        coarse = one.coarse_maps
-        rest = one.predict_coarse(shapes) + coarse.loss.level[:, None, None]
+        coarse = self.fitted_frames.coarse_maps
+        predicted = self.fitted_frames.predict_coarse(shapes) + coarse.loss.level[:, None, None]
         response, degrees = self.image_grid.response, coarse.loss.degrees
-        return reconstruct_reflectivity(response, coarse.power, rest, degrees=degrees)
+        return reconstruct_reflectivity(response, coarse.power, predicted, degrees=degrees)
 
     def run(self) -> list[ShapeParameters]:
         """Run the search and return the shapes."""
@@ -146,13 +145,13 @@ class ShapeSearch:
         Args:
             places: positions of detections, the strongest first [m].
         """
-        lattice, found = self.image_grid, list[ShapeParameters]()
+        grid, found = self.image_grid, list[ShapeParameters]()
         for place in islice(places, _MAX_SHAPES):
             x, y = place[:2].tolist()
-            ball = ShapeParameters("sphere", (x, y), 0.0, *_DETECTION_SIZES, lattice.height)
-            near = (lattice.positions - place[:2]).norm(dim=1) < _MAX_MERGE_GAP
-            usual = float(self.first_image[near].sum().clamp_min(1e-4)) / mean_rcs(ball)
-            options = [replace(ball, brightness=10**k * usual) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+            ball = ShapeParameters("sphere", (x, y), 0.0, *_DETECTION_SIZES, grid.height)
+            near = (grid.positions - place[:2]).norm(dim=1) < _MAX_MERGE_GAP
+            guess = float(self.first_image[near].sum().clamp_min(1e-4)) / mean_rcs(ball)
+            options = [replace(ball, brightness=10**k * guess) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
             found.append(self.select_best(found, options))
         return self.prune(self.refine(found)) if found else []
 
@@ -171,17 +170,17 @@ class ShapeSearch:
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _MIN_GROUP_FRACTION * total]
         known, born = list(shapes), list[tuple[Tensor, ShapeParameters]]()
-        gain, vain = self.fitted_frames.total_gain(known), 0
+        gain, failures = self.fitted_frames.total_gain(known), 0
         for part in parts[: _MAX_SHAPES - len(shapes)]:
-            one = self.select_best(known, self.propose_for_group(part))
-            new = self.fitted_frames.total_gain([*known, one])
-            if new > gain:
-                gain, vain = new, 0
-                known.append(one)
-                born.append((part, one))
-            elif (vain := vain + 1) == _MAX_FAILED_GROUPS:
+            shape = self.select_best(known, self.propose_for_group(part))
+            new_gain = self.fitted_frames.total_gain([*known, shape])
+            if new_gain > gain:
+                gain, failures = new_gain, 0
+                known.append(shape)
+                born.append((part, shape))
+            elif (failures := failures + 1) == _MAX_FAILED_GROUPS:
                 break  # weaker groups add nothing
-        found = [one for _, one in self.unite_groups(shapes, born)]
+        found = [shape for _, shape in self.unite_groups(shapes, born)]
         return found + self.propose_corners([*shapes, *found])
 
     def propose_corners(self, shapes: Shapes) -> list[ShapeParameters]:
@@ -192,14 +191,14 @@ class ShapeSearch:
         Args:
             shapes: known shapes.
         """
-        one, lattice = self.fitted_frames, self.image_grid
-        power, loss = one.coarse_maps.power, one.coarse_maps.loss
-        rest = one.predict_coarse(shapes)
-        nothing = (power - loss.level[:, None, None]).clamp_min(rest)
-        saved = loss.bin_losses(rest, power) - loss.bin_losses(nothing, power)
-        gain = lattice.response.average_over_bins(saved)
-        at = one.radar.positions.detach()[:, :2]
-        direction = torch.nn.functional.normalize(at[:, None] - lattice.positions, dim=2)
+        likelihood, grid = self.fitted_frames, self.image_grid
+        power, loss = likelihood.coarse_maps.power, likelihood.coarse_maps.loss
+        predicted = likelihood.predict_coarse(shapes)
+        explained = (power - loss.level[:, None, None]).clamp_min(predicted)
+        saved = loss.bin_losses(predicted, power) - loss.bin_losses(explained, power)
+        gain = grid.response.average_over_bins(saved)
+        radars = likelihood.radar.positions.detach()[:, :2]
+        direction = torch.nn.functional.normalize(radars[:, None] - grid.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
         cosines = (direction @ corner_direction(yaw) for yaw in yaws)
         score = torch.stack([((c > _MIN_CORNER_COSINE) * gain).sum(0) for c in cosines])
@@ -207,10 +206,10 @@ class ShapeSearch:
         for _ in range(_CORNERS_PER_ROUND):
             best, yaw = score.amax(0), score.argmax(0)
             index = int(best.argmax())
-            x, y = lattice.positions[index].tolist()
+            x, y = grid.positions[index].tolist()
             corner = ShapeParameters("corner", (x, y), yaws[int(yaw[index])])
             options = [
-                replace(corner, height=part * lattice.height, brightness=brightness)
+                replace(corner, height=part * grid.height, brightness=brightness)
                 for part in (0.6, 1.0, 1.5)
                 for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
             ]
@@ -218,11 +217,11 @@ class ShapeSearch:
             new = self.select_best(known, options)
             for _ in range(2):
                 # The minimum is narrow in position and heading: refine the start of the fit.
-                new = self.select_best(known, perturb_shape(new, lattice.step))
+                new = self.select_best(known, perturb_shape(new, grid.step))
             if self.evidence([*known, new]) <= self.evidence(known):
                 break
             found.append(new)
-            near = (lattice.positions - lattice.positions[index]).norm(dim=1) < _MAX_MERGE_GAP
+            near = (grid.positions - grid.positions[index]).norm(dim=1) < _MAX_MERGE_GAP
             score[:, near] = 0.0
         return found
 
@@ -237,7 +236,7 @@ class ShapeSearch:
             shapes: known shapes.
             born: groups of the image, and their proposed shapes.
         """
-        # Tried pairs are kept: the number of a group that is no more would go to another one.
+        # Tried pairs keep their tensors: Python gives the id of a deleted one to the next.
         found, tried = list(born), dict[tuple[int, int], object]()
         places = self.image_grid.positions
         while True:
@@ -252,11 +251,11 @@ class ShapeSearch:
             _, a, b = min(pairs, key=lambda pair: pair[0])
             tried[id(a[0]), id(b[0])] = a, b
             others = [pair for pair in found if pair is not a and pair is not b]
-            known = [*shapes, *(one for _, one in others)]
-            part = a[0] + b[0]
-            one = self.select_best(known, self.propose_for_group(part))
-            if self.evidence([*known, one]) > self.evidence([*known, a[1], b[1]]):
-                found = [*others, (part, one)]
+            known = [*shapes, *(shape for _, shape in others)]
+            union = a[0] + b[0]
+            shape = self.select_best(known, self.propose_for_group(union))
+            if self.evidence([*known, shape]) > self.evidence([*known, a[1], b[1]]):
+                found = [*others, (union, shape)]
 
     def propose_for_group(self, group: Tensor) -> list[ShapeParameters]:
         """Propose shapes for a group of bright points.
@@ -264,10 +263,8 @@ class ShapeSearch:
         Args:
             group: strength of every point [m²], zero outside the group.
         """
-        lattice = self.image_grid
-        rows = proposals.propose_shapes(
-            lattice.positions, group, step=lattice.step, height=lattice.height
-        )
+        grid = self.image_grid
+        rows = proposals.propose_shapes(grid.positions, group, step=grid.step, height=grid.height)
         total = float(group.sum())
         return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
@@ -278,7 +275,7 @@ class ShapeSearch:
             known: other shapes.
             candidates: candidate shapes.
         """
-        return max(candidates, key=lambda one: self.evidence([*known, one]))
+        return max(candidates, key=lambda shape: self.evidence([*known, shape]))
 
     def refine(self, shapes: Shapes) -> list[ShapeParameters]:
         """Refine shapes by a short fit.
@@ -399,11 +396,12 @@ class ShapeSearch:
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
             boxes = [enclosing_box((a, b), turn) for turn in _BOX_YAWS]
-            least = min(boxes, key=lambda one: one.length * one.width)
-            one = self.select_best(rest, [*boxes, *proposals.propose_people_and_vehicles(least)])
-            if self.evidence([*rest, one]) < self.evidence(found) - _MAX_EVIDENCE_DEFICIT:
+            smallest = min(boxes, key=lambda box: box.length * box.width)
+            options = [*boxes, *proposals.propose_people_and_vehicles(smallest)]
+            merged = self.select_best(rest, options)
+            if self.evidence([*rest, merged]) < self.evidence(found) - _MAX_EVIDENCE_DEFICIT:
                 continue
-            new = self.refine([*rest, one])
+            new = self.refine([*rest, merged])
             if self.is_better(new, found):
                 found = new
 
