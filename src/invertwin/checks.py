@@ -37,8 +37,8 @@ def checked_tensor(
     Args:
         value: tensor, array or nested sequence of numbers.
         shape: expected size of every dimension, None where any size will do.
-        what: what the value is, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the value, for the message.
+        do: remedy, for the message.
         most: greatest magnitude.
 
     Raises:
@@ -60,8 +60,8 @@ def to_tensor(value: object, what: str, do: str) -> Tensor:
 
     Args:
         value: tensor, array or nested sequence of numbers.
-        what: what the value is, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the value, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: not numbers.
@@ -78,8 +78,8 @@ def checked_type(value: object, kind: type, what: str, do: str) -> None:
     Args:
         value: the value.
         kind: the type.
-        what: what it is, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the value, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: another type.
@@ -96,8 +96,8 @@ def check_choice(
     Args:
         value: the value.
         known: the words.
-        what: what comes before the words in the message.
-        do: what the user can do about it, for the message.
+        what: noun before the words in the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: another value.
@@ -112,7 +112,7 @@ def check_some(values: Sized, what: str, do: str) -> None:
     Args:
         values: the values.
         what: one of them, for the message.
-        do: what the user can do about it, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: no value.
@@ -126,8 +126,8 @@ def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> 
 
     Args:
         value: numbers [3] or [point, 3].
-        what: what the points are, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the points, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: wrong shape, NaN or infinite, or no point.
@@ -144,9 +144,9 @@ def checked_ascending(value: object, what: str, do: str, least: int = 2) -> Tens
 
     Args:
         value: tensor, array or sequence of numbers.
-        what: what they are, for the message.
-        do: what the user can do about it, for the message.
-        least: how many there must be.
+        what: noun for the values, for the message.
+        do: remedy, for the message.
+        least: least number of values.
 
     Raises:
         InputError: not numbers, too few, or some that do not ascend.
@@ -192,8 +192,8 @@ def check_shape(value: Tensor, shape: Sequence[int | None], what: str, do: str) 
     Args:
         value: the tensor.
         shape: expected size of every dimension, None where any size will do.
-        what: what the value is, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the value, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: another shape.
@@ -332,8 +332,8 @@ def check_orthonormal(axes: Tensor, what: str, do: str) -> None:
 
     Args:
         axes: [*, 3, 3].
-        what: what they are, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the values, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: other columns.
@@ -359,8 +359,8 @@ def refuse_derivatives(value: Tensor | None, what: str, do: str) -> None:
 
     Args:
         value: the tensor.
-        what: what it is, for the message.
-        do: what the user can do about it, for the message.
+        what: noun for the value, for the message.
+        do: remedy, for the message.
 
     Raises:
         InputError: a tensor with derivatives.

@@ -140,7 +140,7 @@ class ForwardModel(ABC):
         A fit calls it in a thread of its own, while it predicts.
 
         Args:
-            observed: From ``observe``.
+            observed: Map from ``observe``.
             sensor: The sensor that recorded it.
         """
         return observed

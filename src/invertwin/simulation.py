@@ -67,11 +67,11 @@ def simulate(
     The smooth mean of such spectra is predicted by ``invertwin.SurrogateMap``.
 
     Args:
-        scene: What is seen.
+        scene: Scene to trace.
         radar: Arrays, waveform and poses.
         grid: Bins, see ``Radar.grid``.
         seed: Seed of places, phases and noise.
-        sampling: How paths are sampled; None = ``Sampling()``.
+        sampling: Sampling of paths; None = ``Sampling()``.
         speckle: Rough points and paths to use again, so that speckle stays while the scene moves.
         snr_db: Noise relative to the mean signal power per sample.
         noise_figure_db: Thermal noise of a receiver instead.
@@ -138,7 +138,7 @@ def simulate_chirps(
         radar: Arrays, waveform and poses.
         chirps: Timing of the ramps.
         seed: Places and phases; those of rough points belong to the surface and move with it.
-        sampling: How paths are sampled, of one bounce; None: depth 1, and 3 with mirrors.
+        sampling: Sampling of paths, of one bounce; None: depth 1, and 3 with mirrors.
         retrace: Trace visibility and amplitudes anew at every ramp, instead of moving the
             points seen at the start of the frame. A function of time always does, but see the next.
         visibility_every: Loops for which visibility and amplitudes of a function of time are kept;

@@ -128,7 +128,7 @@ class Capture:
 
         Args:
             beat: complex (I/Q) samples of every virtual channel; dtype and bits are kept.
-            radar: what measured them.
+            radar: radar that measured them.
             times: time of each frame [s].
             unit: unit of the samples: "1", received over sent, or "count", of a file.
 
@@ -162,11 +162,11 @@ class Capture:
         Args:
             profile: analytic signal at radio frequency: an echo from R turns by 4π f/c (r − R).
             ranges: R = L/2 of its samples, uniform, less bias and range origin [m].
-            radar: what measured them.
+            radar: radar that measured them.
             times: time of each frame on the radar's clock [s].
             track: from which the radar's positions are read, at ``times + clock_offset``.
-            clock_offset: how far the track's clock is ahead of the radar's [s].
-            range_bias: what was subtracted from the radar's own ranges [m].
+            clock_offset: clock of the track minus clock of the radar [s].
+            range_bias: bias that was subtracted from the radar's own ranges [m].
             survey: known positions of targets [m].
         """
         variables = {"range_profile": to_data_array(PROFILE_DIMS, profile, "1")}
@@ -310,8 +310,8 @@ class Capture:
         """A capture of the same data with another clock offset and range bias.
 
         Args:
-            clock_offset: how far the track's clock is ahead of the radar's [s].
-            range_bias: what is subtracted from the radar's own ranges [m].
+            clock_offset: clock of the track minus clock of the radar [s].
+            range_bias: bias to subtract from the radar's own ranges [m].
 
         Raises:
             InputError: the capture has no track, or holds beat samples.

@@ -82,7 +82,7 @@ class ChirpCapture:
 
         Args:
             first: Number of the first chirp, from 0.
-            count: How many.
+            count: Number of them.
         """
         chirps = replace(self.chirps, count=count)
         return replace(self, beat=self.beat[:, first : first + count], chirps=chirps)

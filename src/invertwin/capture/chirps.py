@@ -34,7 +34,7 @@ class ChirpSettings:
 
     Attributes:
         start_frequency: frequency at the start of the ramp, before the ADC starts [Hz].
-        slope: how fast the frequency rises in a ramp [Hz/s].
+        slope: slope of the ramp [Hz/s].
         sample_rate: output rate of the ADC [Hz].
         samples: number of samples per chirp and receiver.
         transmit_order: numbers from 1 of the transmitters, in the order of sending in one loop.
@@ -51,7 +51,7 @@ class ChirpSettings:
         lanes: lanes of the LVDS link: 4 (xWR12xx, 14xx) or 2 (later devices); None = not known.
         channel_factors: calibration of the channels: factors of their beat signals, by the numbers
             of the elements [tx][rx][real, imaginary]; none = ones.
-        range_bias: how much too long measured ranges are [m].
+        range_bias: measured minus true range [m].
 
     Raises:
         InputError: a value out of range, a transmitter that sends twice per loop, a ramp that
@@ -247,7 +247,7 @@ def adc_counts(
         beat: simulated; without a chirp dimension every chirp of a frame is the same.
         settings: whose bits, loops and kind of samples are used.
         full_scale: amplitude of the largest count, in the units of ``beat``.
-        order: of the turns of ``beat``'s transmitters, counted from 0, as in `Chirps`; None = they
+        order: order of ``beat``'s transmitters, counted from 0, as in `Chirps`; None = they
             are in the order of sending.
 
     Raises:
@@ -274,7 +274,7 @@ def shortest_loop(order: Sequence[int], loops: int) -> tuple[tuple[int, ...], in
 
     Args:
         order: transmitters in their order of sending.
-        loops: how often the order is sent.
+        loops: number of repetitions of the order.
     """
     whole = tuple(order)
     for length in range(1, len(whole)):

@@ -37,7 +37,7 @@ class Fault:
     Attributes:
         name: ``complex only by type``, ``detect_ghosts``, ``dropped samples``, ``phase break``,
             ``detect_leakage`` or ``detect_saturation``.
-        evidence: What in the samples says so, and what to do.
+        evidence: Evidence in the samples, and the remedy.
     """
 
     name: str
@@ -56,7 +56,7 @@ def find_faults(
 
     Args:
         recording: Samples as they were recorded, before a calibration.
-        range_min: From where the strongest echo is looked for [m]; None = as ``search_ranges``.
+        range_min: Least range of the strongest echo [m]; None = as ``search_ranges``.
         range_max: Up to where.
     """
     if isinstance(recording, Capture):
@@ -90,9 +90,9 @@ def search_ranges(
     its last 3 cells are those before zero, and those of real samples are mirrored ones.
 
     Args:
-        recording: With samples.
-        range_min: What the user has chosen.
-        range_max: What the user has chosen.
+        recording: Recording with samples.
+        range_min: Nearest range that the user has chosen [m].
+        range_max: Farthest range that the user has chosen [m].
     """
     radar = recording.radar()
     leaking = _LEAKAGE_CELLS * require_sampled_waveform(radar).range_resolution
@@ -260,7 +260,7 @@ def detect_ghosts(
     it, below which chance agreement is frequent.
 
     Args:
-        rates: Of ``_strongest_range_rates``.
+        rates: Result of ``_strongest_range_rates``.
         opposite: The opposite range rates, where conjugates are.
         waveform: Its unambiguous range.
         real: Whether the samples were real.
@@ -441,7 +441,7 @@ def detect_leakage(
     Args:
         beat: Samples.
         waveform: Its ranges.
-        window: Over the samples.
+        window: Window over the samples.
         search_range: First and last range where echoes are looked for [m].
         real: Whether the samples were real.
     """

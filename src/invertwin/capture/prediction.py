@@ -18,7 +18,7 @@ def covariances(
 
     Args:
         rows: Signals that follow the same tones.
-        order: How many samples before.
+        order: Number of earlier samples.
     """
     past = rows.unfold(-1, order + 1, 1).flip(-1)  # [row, place, lag]
     return torch.einsum("rnk,rnl->nkl", past.conj(), past) / len(rows)
@@ -30,7 +30,7 @@ def prediction_coefficients(
     """Coefficients with the least mean residual at the places that are kept, the first one 1.
 
     Args:
-        products: Of ``covariances``.
+        products: Result of ``covariances``.
         mask: Places that count.
     """
     mean = products[mask].sum(0)
@@ -47,8 +47,8 @@ def prediction_residuals(
     The same tones, read backwards, follow from the conjugate coefficients.
 
     Args:
-        products: Of ``covariances``.
-        coefficients: Of ``prediction_coefficients``.
+        products: Result of ``covariances``.
+        coefficients: Result of ``prediction_coefficients``.
     """
     both = torch.stack([coefficients, coefficients.conj().flip(0)])
     return 0.5 * torch.einsum("dk,nkl,dl->n", both.conj(), products, both).real.clamp_min(0.0)

@@ -93,7 +93,7 @@ class Link:
         shared_visibility: One visibility test from ``tx`` serves both antennas (V·V = V); the
             boundary then has one term instead of two (derivations §3).
         tx_jones: Polarisation of the transmitters, about the radar's z axis.
-        rx_jones: That of the receivers.
+        rx_jones: Jones vectors of the receivers.
         range_origin: Range from which each frame counts that of its maps [m]; None = 0.
     """
 
@@ -141,7 +141,7 @@ class Paths(Rows):
         first: World position of the first scattering point [m].
         last: World position of the last point [m]; equal to ``first`` for one bounce.
         kind: ``power``, ``coherent``, ``rough`` or ``field`` (a mixture of the last two).
-        boundary: Which rows are boundary paths: zero in value, with the derivative of a moving
+        boundary: Mask of boundary paths: zero in value, with the derivative of a moving
             shadow edge (derivations §3).
         velocity: World velocity of the last point [m/s]; None = at rest.
         first_velocity: That of the first one, where a mirror shows another; None = the same.

@@ -19,7 +19,7 @@ def require_files(files: Iterable[tuple[Path, str]], faults: Iterable[str] = ())
 
     Args:
         files: Paths, and what each should be.
-        faults: What else is wrong, as errors say it.
+        faults: Further faults, as errors state them.
     """
     found = []
     for file, what in files:

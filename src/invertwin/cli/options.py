@@ -50,7 +50,7 @@ def option(*words: str, **given: Any) -> Any:
 
     Args:
         words: Its names, if it has other ones than its parameter, and last its help.
-        given: What ``typer.Option`` takes.
+        given: Arguments of ``typer.Option``.
     """
     return typer.Option(*words[:-1], help=words[-1], **given)
 
@@ -178,8 +178,8 @@ class RecordingOptions(OutputOptions):
         """The command line that does the same from another folder.
 
         Args:
-            name: of the command.
-            folder: where it is called; paths are relative to it.
+            name: name of the command.
+            folder: working folder of the call; paths are relative to it.
         """
         words, hints = [name], get_type_hints(type(self), include_extras=True)
         for field in fields(self):

@@ -44,7 +44,7 @@ class ReportView:
     """A display in three dimensions; a report holds one at most.
 
     Attributes:
-        html: Of `viewer.view_html`.
+        html: HTML of `viewer.view_html`.
     """
 
     html: str
@@ -62,8 +62,8 @@ def report_html(
 
     Args:
         title: Heading.
-        status: What came out, in a sentence.
-        note: What the run file says about the run; blank lines part paragraphs.
+        status: Outcome, in a sentence.
+        note: Note of the run file about the run; blank lines part paragraphs.
         parts: Tables, pictures and a view in reading order.
         again: The command that does it again, in the run's own folder.
         files: Run files as used, by their path in the folder.
@@ -94,13 +94,13 @@ def write_report(
     """Write metrics.json and report.html; return the tables, to be printed.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
         metrics: Numbers of the run.
         title: Heading.
-        status: What came out, in a sentence.
+        status: Outcome, in a sentence.
         parts: Tables and pictures in reading order.
         again: The command, with its file where the run has no run file.
-        note: What the run file says about the run.
+        note: Note of the run file about the run.
     """
     folder.write_json("metrics.json", metrics)
     files = folder.run_files
@@ -126,10 +126,10 @@ def save_picture(
     """Write a figure as a PNG file, and return it for the report.
 
     Args:
-        folder: Of the run.
-        name: Of the file, without its ending.
+        folder: Folder of the run.
+        name: Name of the file, without its ending.
         figure: The figure.
-        title: In the report; without it the name.
+        title: Title in the report; None = the name.
         note: A key among the notes of texts.toml, or none.
     """
     from invertwin.plotting import png_bytes
@@ -150,8 +150,8 @@ def quantity_table(
     """A table of the values that texts.toml has a label for, in its order.
 
     Args:
-        title: Of the table.
-        values: By the keys of metrics.json.
+        title: Title of the table.
+        values: Values by the keys of metrics.json.
         skip: Keys to leave out.
         label_table: The table of labels.
     """

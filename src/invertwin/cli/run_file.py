@@ -62,8 +62,8 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """The tables of a run file.
 
     Args:
-        path: Of the file, for errors.
-        text: What is in it.
+        path: Path of the file, for errors.
+        text: Content of the file.
 
     Raises:
         InputError: It is not TOML.

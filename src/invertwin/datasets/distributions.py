@@ -151,7 +151,7 @@ class Choice(Distribution):
 
     Attributes:
         values: Those to choose from.
-        weights: How often each is chosen, relative to the others; without them all alike.
+        weights: Relative frequency of each choice; None = equal.
 
     Raises:
         InputError: No values, or weights that are not one for each, negative, or all zero.
@@ -187,7 +187,7 @@ class Presence(Distribution):
     """The presence of a key or a table, such as an object, with a probability.
 
     Attributes:
-        probability: That it is.
+        probability: Probability that it is.
     """
 
     probability: UnitFraction = 0.5

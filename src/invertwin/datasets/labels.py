@@ -33,13 +33,13 @@ def object_labels(
     (``low`` and ``high`` corner along the world's axes), ``oriented_box`` (``center``, ``size`` and
     ``rotation``: along the object's own axes, the columns of ``rotation``), ``velocity`` (the mean
     over its vertices), ``triangles`` (number of the first one in the scene, and how many),
-    ``visibility``
-    (share of the surface that each position of the radar sees), and ``joints`` where it has some.
+    ``visibility`` (share of the surface that each position of the radar sees), and ``joints`` where
+    it has some.
 
     Args:
-        scene: At the time of the recording.
-        visibility: Of ``triangle_visibility``.
-        classes: By name; an object without one is a class of its own name.
+        scene: Scene at the time of the recording.
+        visibility: Result of ``triangle_visibility``.
+        classes: Classes by name; an object without one is a class of its own name.
         joints: Places of joints in the world [m], by object and name.
     """
     rows, first = [], 0
@@ -86,7 +86,7 @@ def convert_old_labels(labels: Any, name: str = "") -> Any:
     rotations P R Pᵀ.
 
     Args:
-        labels: of a sample, or a part of them.
+        labels: labels of a sample, or a part of them.
         name: key of the part.
     """
     if isinstance(labels, dict):

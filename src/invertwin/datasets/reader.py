@@ -29,13 +29,13 @@ class SampleDataset(Dataset[Any]):
     sample is asked for.
 
     Args:
-        folder: Of the data set, or of all of its parts.
-        entries: Which entries are read; the rest costs nothing. None = all.
+        folder: Folder of the data set, or of all of its parts.
+        entries: Entries to read; the others cost nothing. None = all.
         transform: Makes of a sample what a network takes. Workers that are spawned need a function
             of a module, not a lambda.
 
     Attributes:
-        manifest: What the folder says of itself; of parts, that of the first one.
+        manifest: Manifest of the folder; of parts, that of the first one.
 
     Raises:
         InputError: No complete data set, or an entry that it does not have.

@@ -93,10 +93,10 @@ def describe_shard(name: str, first: int, samples: int, content: bytes) -> Shard
     """The manifest's row of a shard.
 
     Args:
-        name: Of the file.
+        name: Name of the file.
         first: Number of its first sample.
-        samples: How many it has.
-        content: Of the file.
+        samples: Number of samples in it.
+        content: Content of the file.
     """
     digest = hashlib.sha256(content).hexdigest()
     return Shard(name=name, first=first, samples=samples, size=len(content), sha256=digest)
@@ -106,7 +106,7 @@ def shard_ranges(samples: int, size: int, part: tuple[int, int]) -> list[tuple[i
     """Number, first sample and length of every shard of a part: part i of n has every n-th one.
 
     Args:
-        samples: Of the whole data set.
+        samples: Number of samples of the whole data set.
         size: Samples of a shard; the last one may have fewer.
         part: Number from 1, and of how many.
 
@@ -149,7 +149,7 @@ def read_manifests(folder: Path) -> list[tuple[Path, DatasetManifest]]:
     """The manifest of a folder, or those of its parts, each with its folder.
 
     Args:
-        folder: Of the data set.
+        folder: Folder of the data set.
 
     Raises:
         InputError: None, a damaged one, or those of different data sets.

@@ -198,7 +198,7 @@ def estimate_clutter(
     are left out, as far as the model blurs in range, so that clutter does not take their echoes.
 
     Args:
-        scene: what is known, fitted objects at their present places.
+        scene: known scene, with the fitted objects at their present poses.
         observation: recording of a radar with a ``SurrogateMap``.
         fitted: names of the fitted objects.
         seed: seed of the predicted map.

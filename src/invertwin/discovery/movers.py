@@ -37,7 +37,7 @@ class DetectedEcho:
         range: [m].
         range_rate: Range rate, positive moves away [m/s].
         u, v: Direction cosines.
-        position: In the world [m].
+        position: Position in the world [m].
         coherence: 1 where the channels are a plane wave.
     """
 
@@ -59,7 +59,7 @@ class MovingBody(nn.Module):
     with a velocity of each of its vertices.
 
     Attributes:
-        echo: Where it started.
+        echo: Echo from which it started.
         place: parameter [2], of the body's nearest point from the start, along and across [m].
         height: parameter [], the same, up [m]; fitted if the radar has several rows of antennas.
         velocity: parameter [2], along and across [m/s].
@@ -81,9 +81,9 @@ class MovingBody(nn.Module):
 
         Args:
             object: Name of the object; where the scene has it does not matter.
-            scene: With the object.
-            radar: In one pose.
-            echo: Where to start.
+            scene: Scene with the object.
+            radar: Radar with one pose.
+            echo: Echo from which to start.
             free: Names of the parameters that are fitted; the height goes with the place.
             center: Initial centre [3] in the world [m]; None = the front is at the echo.
 
@@ -130,8 +130,8 @@ class MovingBody(nn.Module):
         """The scene with the body in motion, where it is at a time.
 
         Args:
-            scene: With the object.
-            time: After the middle of the frame [s].
+            scene: Scene with the object.
+            time: Time after the middle of the frame [s].
         """
         item = scene[self.object]
         mesh = Mesh((item.mesh.vertices - item.mesh.center) * self.size.exp(), item.mesh.faces)
@@ -192,9 +192,9 @@ def point_response(
 
     Args:
         model: The map.
-        radar: In one pose.
-        echo: Where, and how fast.
-        time: After which it is seen, moving on along its line of sight [s].
+        radar: Radar with one pose.
+        echo: Position and velocity of the echo.
+        time: Time after which it is seen, moving on along its line of sight [s].
 
     Returns:
         Power [frame, velocity, range, u, v].
@@ -275,7 +275,7 @@ class MovingTargetMaps:
     """Maps about an echo that moves: of its twin, and of a bare point in its place.
 
     Attributes:
-        model: What the maps show.
+        model: Model of the maps.
         twin_map: Power [velocity, range, u, v].
         point_map: The same of the point.
     """
@@ -302,7 +302,7 @@ class MovingTargetFit:
         recording: One frame of chirps.
         model: Map of the whole recording.
         body: As fitted.
-        reconstruction: Of the fit.
+        reconstruction: Result of the fit.
     """
 
     recording: ChirpCapture
@@ -316,10 +316,10 @@ class MovingTargetFit:
         """Maps about the place that the echo has moved to.
 
         Args:
-            scene: With the body's object.
-            cells: To either side of the echo.
-            time: After the middle of the recording [s].
-            seed: Of the rays.
+            scene: Scene with the body's object.
+            cells: Number of cells to either side of the echo.
+            time: Time after the middle of the recording [s].
+            seed: Seed of the rays.
         """
         radar, echo = self.recording.radar(), self.body.echo
         range_ = echo.range + echo.range_rate * time

@@ -76,7 +76,7 @@ class DetectedObject:
 
         Args:
             name: Name of the object.
-            position: Where it is [m].
+            position: Position [m].
             deviations: Standard deviations of its coordinates.
             sure: Probability that it exists.
             motion: Its velocity [m/s] and track.

@@ -15,7 +15,7 @@ class Evaluation(nn.Module):
 
     Args:
         module: the other module; its parameters are named `module.…` here.
-        function: what is evaluated.
+        function: function to evaluate.
     """
 
     def __init__(self, module: nn.Module, function: Callable[[], Any]) -> None:

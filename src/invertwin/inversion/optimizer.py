@@ -27,7 +27,7 @@ class Optimizer:
             Gauss–Newton, a rate is the longest change of a parameter in a step; it does not fall.
         rotation_rate: Rate of angles: parameters named ``rotation``, ``yaw`` or ``spread``; None =
             ``rate``.
-        final_rate: What ``rate`` has fallen to at the last step, along a cosine; None = ``rate`` /
+        final_rate: Rate at the last step, reached along a cosine; None = ``rate`` /
             20. The rates of all parameters fall alike.
         momentum: Momentum of SGD.
         curvature_every: For Gauss–Newton, steps from one curvature to the next. Derivatives of the

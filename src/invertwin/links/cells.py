@@ -39,8 +39,9 @@ class CellSampling:
     """Numbers of sample points in the cells of a map.
 
     Attributes:
-        points: In a cell, at least; a cell has the next square number of them.
-        edge_points: On edges of the scene, for each transmitter; they serve derivatives alone.
+        points: Least number of points in a cell; a cell has the next square number of them.
+        edge_points: Number of points on edges of the scene, for each transmitter; they serve
+            derivatives alone.
         boundary: False leaves boundary paths out: derivatives at fixed visibility, for ablation.
 
     Raises:
@@ -64,7 +65,7 @@ class Cells(ReceiverLocations):
     """Cells of a surface, which hides nothing and is at rest.
 
     Attributes:
-        sampling: How many points.
+        sampling: Numbers of points.
     """
 
     sampling: CellSampling
@@ -74,7 +75,7 @@ class Cells(ReceiverLocations):
         """The same cells with other numbers of points.
 
         Args:
-            sampling: How many points.
+            sampling: Numbers of points.
         """
         return replace(self, sampling=sampling)  # type: ignore[type-var]
 
@@ -97,7 +98,7 @@ class Cells(ReceiverLocations):
         """Points spread evenly over every cell [m].
 
         Args:
-            rng: What draws them.
+            rng: Random number generator.
         """
 
     @abstractmethod
@@ -169,7 +170,7 @@ class MapPlane(Cells):
         corner: [m].
         first, second: Sides, from the corner on [m].
         count: Cells along them.
-        sampling: How many points.
+        sampling: Numbers of points.
 
     Raises:
         InputError: Wrong shapes, NaN, sides without an area between them, or no cell.
@@ -212,7 +213,7 @@ class MapPlane(Cells):
             high: Greatest x and y [m].
             height: z [m].
             cell_size: Length of a cell's sides; the nearest that divides the sides of the map [m].
-            sampling: How many points.
+            sampling: Numbers of points.
 
         Raises:
             InputError: Wrong shapes or numbers, or a map without an area.
@@ -287,8 +288,9 @@ class MapMesh(Cells):
     """The triangles of a mesh, each a cell.
 
     Attributes:
-        mesh: In the world [m]. Where it covers a surface of the scene, keep some millimetres off.
-        sampling: How many points.
+        mesh: Mesh in the world [m]. Where it covers a surface of the scene, keep it some
+            millimetres off.
+        sampling: Numbers of points.
 
     Raises:
         InputError: A triangle without area.

@@ -27,8 +27,8 @@ def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
     their thickness twice.
 
     Args:
-        paths: From its `PathSolver`.
-        frequency: Of its scene [Hz].
+        paths: Paths from its `PathSolver`.
+        frequency: Frequency of its scene [Hz].
 
     Raises:
         InputError: Other arrays, or diffuse reflection.

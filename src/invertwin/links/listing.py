@@ -26,10 +26,10 @@ def path_table(
     the world in degrees, x towards y and up to z.
 
     Args:
-        paths: From ``trace_paths``.
+        paths: Paths from ``trace_paths``.
         link: Numbers of transmitter and receiver.
-        tx: At the transmitters.
-        rx: At the receivers.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
     """
     some = paths.select_link(*link)
     amplitude, _ = path_amplitudes(some, tx, rx)

@@ -35,10 +35,10 @@ class ReceiverLocations(ABC):
         """Compute gain and delay spread at the locations.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            propagation: How paths are found, and how they add up.
-            seed: Of all that is drawn.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            propagation: Settings of the path search and of the sum over paths.
+            seed: Seed of all random numbers.
         """
 
     def with_sample_count(self, samples: int) -> "ReceiverLocations":

@@ -65,14 +65,14 @@ class PropagationSettings:
 
     Attributes:
         frequency: The carrier [Hz].
-        bandwidth: Of the receivers [Hz]: powers are means over this band. 0 = fields add at the
-            carrier alone, None = powers of paths add.
+        bandwidth: Bandwidth of the receivers [Hz]: powers are means over this band. 0 = fields add
+            at the carrier alone, None = powers of paths add.
         depth: Most surfaces that a path meets, see ``trace_paths``.
         edges: Most edges that a path goes round.
         rays: Shot to find sequences of surfaces; None tries all.
         receivers: Antenna and axes of every receiver; of several elements the mean power counts.
         panels: Metasurfaces, whose paths are added, see ``panel_paths``.
-        rough: How paths that rough surfaces scatter are drawn, over all receivers; their power
+        rough: Sampling of paths that rough surfaces scatter, over all receivers; their power
             is added. None leaves them out.
 
     Raises:
@@ -105,10 +105,10 @@ class PropagationSettings:
         """The paths from all transmitters to some receivers.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            positions: Of the receivers [m].
-            seed: Of the rays that find them.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
+            seed: Seed of the rays that find them.
         """
         link, rays = (sensor.positions, positions, self.frequency), self.rays
         found = trace_paths(scene, *link, depth=self.depth, edges=self.edges, rays=rays, seed=seed)
@@ -120,10 +120,10 @@ class PropagationSettings:
         """Compute gain and delay spread at points, in memory independent of their number.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            positions: Of the receivers [m].
-            seed: Of the rays that find paths.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
+            seed: Seed of the rays that find paths.
         """
         gain, moments = self.gains_and_moments(scene, sensor, positions, seed)
         return LinkStatistics(gain, delay_spread_from_moments(moments))
@@ -134,10 +134,10 @@ class PropagationSettings:
         """Gains at points, as paths add up, and sums of ``moments``. Arguments as in ``at``.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            positions: Of the receivers [m].
-            seed: Of the rays that find paths.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
+            seed: Seed of the rays that find paths.
         """
 
         def evaluate_batch(batch: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,10 +157,10 @@ class PropagationSettings:
         The excess delay is that over the straight line.
 
         Args:
-            paths: From ``trace_paths``.
-            tx: Where the transmitters are [m].
-            rx: Where the receivers are [m].
-            tx_mount: At the transmitters.
+            paths: Paths from ``trace_paths``.
+            tx: Positions of the transmitters [m].
+            rx: Positions of the receivers [m].
+            tx_mount: Antenna mount of the transmitters.
         """
         power = path_powers(paths, tx_mount, self.receivers)
         excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
@@ -172,9 +172,9 @@ class PropagationSettings:
         """Sums of ``moments`` over the paths of each link.
 
         Args:
-            paths: From the sensor to the places.
-            sensor: What sends.
-            positions: Of the receivers [m].
+            paths: Paths from the transmitters to the receivers.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
         """
         each = self.path_moments(paths, sensor.positions, positions, sensor.mount)
         return sum_over_paths(paths, each)
@@ -185,10 +185,10 @@ class PropagationSettings:
         """Sums of ``moments`` of what ``trace_coverage`` does not trace: panels, rough surfaces.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            positions: Of the receivers [m].
-            seed: Of the paths that are drawn.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
+            seed: Seed of the paths that are drawn.
         """
 
         def evaluate_batch(batch: Tensor) -> tuple[Tensor]:
@@ -204,10 +204,10 @@ class PropagationSettings:
         """Sums of ``moments`` over paths that rough surfaces scatter; 0 if these are left out.
 
         Args:
-            scene: What scatters.
-            sensor: What sends.
-            positions: Of the receivers [m].
-            seed: Of the paths that are drawn.
+            scene: Scene with rough surfaces.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
+            seed: Seed of the paths that are drawn.
         """
         if self.rough is None:
             return positions.new_zeros(len(sensor.positions), len(positions), 3)
@@ -225,11 +225,11 @@ class PropagationSettings:
         """H(f) of the first elements, at points. See ``frequency_response``.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            positions: Of the receivers [m].
+            scene: Propagation environment.
+            sensor: Transmitters.
+            positions: Positions of the receivers [m].
             frequencies: [Hz].
-            seed: Of the rays that find paths.
+            seed: Seed of the rays that find paths.
 
         Raises:
             InputError: With scattered power, which has no phase.
@@ -288,11 +288,11 @@ def received_gain(
     """Received over sent power of every link; 0 where no path leads.
 
     Args:
-        paths: From ``trace_paths``.
-        bandwidth: Over which the mean is taken, about the carrier [Hz]; 0 = the carrier alone,
+        paths: Paths from ``trace_paths``.
+        bandwidth: Bandwidth of the mean, about the carrier [Hz]; 0 = the carrier alone,
             None = powers of paths add.
-        tx: At the transmitters; of several elements the mean over all pairs counts.
-        rx: At the receivers.
+        tx: Antenna mount of the transmitters; of several elements the mean over all pairs counts.
+        rx: Antenna mount of the receivers.
     """
     amplitude, delay = path_amplitudes(paths, tx, rx)
     if bandwidth is None:

@@ -149,9 +149,9 @@ def path_amplitudes(
     """Coefficient and delay [s] of every path between every two elements.
 
     Args:
-        paths: From ``trace_paths``.
-        tx: At the transmitters.
-        rx: At the receivers.
+        paths: Paths from ``trace_paths``.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
     """
     sent = tx.element_weights(paths.departure, paths.tx)
     received = rx.element_weights(paths.arrival, paths.rx)
@@ -195,10 +195,10 @@ def frequency_response(
     band, trace again at some frequencies.
 
     Args:
-        paths: From ``trace_paths``.
+        paths: Paths from ``trace_paths``.
         frequencies: One or several, in any order [Hz].
-        tx: At the transmitters.
-        rx: At the receivers.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
 
     Raises:
         InputError: No frequency, or one that is not finite.
@@ -231,13 +231,13 @@ def ofdm_channel(
     shifts, in proportion to each subcarrier's frequency.
 
     Args:
-        paths: From ``trace_paths``.
+        paths: Paths from ``trace_paths``.
         subcarriers: Their number N.
-        spacing: Of subcarriers [Hz].
+        spacing: Spacing of subcarriers [Hz].
         symbols: Their number.
         cyclic_prefix: [s].
-        tx: At the transmitters.
-        rx: At the receivers.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
 
     Raises:
         InputError: A number out of range.
@@ -268,12 +268,12 @@ def impulse_response(
     (``path_amplitudes``).
 
     Args:
-        paths: From ``trace_paths``.
+        paths: Paths from ``trace_paths``.
         bandwidth: B [Hz].
         taps: Their number.
         start: Delay of the first one [s].
-        tx: At the transmitters.
-        rx: At the receivers.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
 
     Raises:
         InputError: A number out of range.

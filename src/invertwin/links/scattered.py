@@ -5,9 +5,8 @@ roughness goes everywhere, by ``Material.incoherent``: the lobes of ``EffectiveR
 the one about the mirror direction has what heights take off the mirror.
 
 Two kinds of paths add up: those that scatter at each of their bounces (``deposit_power``), and
-those that scatter once, with mirrors before or after (``trace_single_scattering``). Paths that
-scatter
-twice and are mirrored as well are left out.
+those that scatter once, with specular reflections before or after (``trace_single_scattering``).
+Paths that scatter twice and are reflected as well are left out.
 """
 
 import math
@@ -51,12 +50,12 @@ def scattered_moments(
     to places, what moving shadows change included.
 
     Args:
-        scene: What scatters; surfaces, no clouds.
-        sensor: What sends.
+        scene: Scene of surfaces, without clouds.
+        sensor: Transmitters.
         receivers: Antenna and axes of every receiver.
-        positions: Of the receivers [m].
+        positions: Positions of the receivers [m].
         frequency: [Hz].
-        sampling: How many paths are drawn, over all receivers; most bounces of a path that
+        sampling: Numbers of paths, over all receivers; most bounces of a path that
             scatters at each.
         seed: Same seed, same paths.
         depth: Most surfaces that a path with mirrors meets.

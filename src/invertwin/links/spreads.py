@@ -19,9 +19,9 @@ def delay_spread(
     """Root mean square spread of the delays by power [s]; 0 of links of one path or none.
 
     Args:
-        paths: From ``trace_paths``.
-        tx: At the transmitters.
-        rx: At the receivers.
+        paths: Paths from ``trace_paths``.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
     """
     power = path_powers(paths, tx, rx)
     total = _sum_links(paths, power)
@@ -42,10 +42,10 @@ def angle_spread(
     square angle [rad]. It does not depend on axes.
 
     Args:
-        paths: From ``trace_paths``.
-        end: Of the paths.
-        tx: At the transmitters.
-        rx: At the receivers.
+        paths: Paths from ``trace_paths``.
+        end: End of the paths.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
 
     Raises:
         InputError: Another end.
@@ -72,9 +72,9 @@ def rician_factor(
     It is 0 without a straight path, and infinite without others.
 
     Args:
-        paths: From ``trace_paths``.
-        tx: At the transmitters.
-        rx: At the receivers.
+        paths: Paths from ``trace_paths``.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
     """
     power = path_powers(paths, tx, rx)
     straight = ((paths.kinds == 0) | (paths.kinds == KINDS.index("transmission"))).all(1)
@@ -88,9 +88,9 @@ def path_powers(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Float64[
     """Received over sent power of each path, mean of all pairs of elements.
 
     Args:
-        paths: From ``trace_paths``.
-        tx: At the transmitters.
-        rx: At the receivers.
+        paths: Paths from ``trace_paths``.
+        tx: Antenna mount of the transmitters.
+        rx: Antenna mount of the receivers.
     """
     amplitude, _ = path_amplitudes(paths, tx, rx)
     return torch.view_as_real(amplitude).square().sum(-1).mean((1, 2))
@@ -108,7 +108,7 @@ def safe_sqrt(square: Tensor) -> Tensor:
     """A root without the infinite derivative at zero.
 
     Args:
-        square: Of which the root is taken; below zero it is zero.
+        square: Number whose root is taken; negative ones count as zero.
     """
     some = square > 0
     return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)

@@ -69,7 +69,7 @@ class TransmitterPosition(nn.Module):
         low: A corner of the box [m]; None = no box.
         high: The opposite corner.
         axes: World axes along which the fit may move it; the others keep their values.
-        number: Of the transmitter.
+        number: Number of the transmitter.
 
     Attributes:
         place: parameter [3], metres.

@@ -50,7 +50,7 @@ class SilhouetteMap(_ImageMap):
 
     Attributes:
         objects: Names of the objects that the mask shows; others may hide them.
-        sampling: Of pixels and outlines.
+        sampling: Sampling of pixels and outlines.
         scatter: Standard deviation of measured masks about the map; None = as large as what a fit
             leaves unexplained.
     """
@@ -86,7 +86,7 @@ class DepthMap(_ImageMap):
 
     Attributes:
         far: Depth where nothing is seen, or what is further away [m].
-        sampling: Of pixels and outlines.
+        sampling: Sampling of pixels and outlines.
         scatter: Standard deviation of measured depths about the map [m]; None = as large as what a
             fit leaves unexplained.
     """

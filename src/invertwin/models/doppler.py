@@ -41,7 +41,7 @@ class RangeDopplerMap(ForwardModel):
         chirps: Timing of the ramps.
         rates: Range rates to show, positive moves away [m/s]; some of those of ``bins``.
         bins: Bins of range rate over the whole unambiguous span.
-        sampling: How paths are sampled; one bounce, fixed visibility.
+        sampling: Sampling of paths; one bounce, fixed visibility.
         mirrors: Names of smooth flat objects at rest, in which what moves is seen a second time
             (ghosts): paths of up to three surfaces.
     """
@@ -69,11 +69,11 @@ class RangeDopplerMap(ForwardModel):
         """All range rates that the chirps tell apart.
 
         Args:
-            radar: What records.
+            radar: Radar that records.
             grid: Ranges and directions.
             chirps: Timing of the ramps.
             oversample: Bins of range rate per cell.
-            sampling: How paths are sampled.
+            sampling: Sampling of paths.
             mirrors: Smooth flat objects at rest.
         """
         bins, how = oversample * chirps.count, sampling or cls.sampling
@@ -110,8 +110,8 @@ class RangeDopplerMap(ForwardModel):
         """Compute the map of moving paths. See ``range_doppler_power``.
 
         Args:
-            paths: With velocities.
-            radar: What records them.
+            paths: Paths with velocities.
+            radar: Radar that records them.
         """
         assert paths.velocity is not None
         return range_doppler_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
@@ -164,10 +164,10 @@ class RangeDopplerMap(ForwardModel):
         """The cells at most so many range and Doppler cells from an echo, in all directions.
 
         Args:
-            range_: Of the echo [m].
+            range_: Range of the echo [m].
             rate: Range rate of the echo [m/s].
-            cells: To either side.
-            radar: What records.
+            cells: Number of cells to either side.
+            radar: Radar that records.
         """
         doppler = velocity_axis(radar, self.chirps).diff()[0] if self.chirps.count > 1 else math.inf
         near = (self.grid.ranges - range_).abs() / radar.waveform.range_resolution

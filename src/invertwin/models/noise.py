@@ -22,10 +22,10 @@ def noisy_realisations(
     Args:
         simulate_beat: function of a realisation's number that returns its beat signal.
         to_map: function that turns a beat signal into a map, as the model observes it.
-        shape: of a beat signal.
+        shape: shape of a beat signal.
         seed: seed of the noise that calibrates the level of a bin.
         holds_fields: whether maps hold parts of fields, not power.
-        dtype: of the noise.
+        dtype: dtype of the noise.
     """
 
     def white_noise(key: int) -> Tensor:

@@ -34,7 +34,7 @@ class SurrogateMap(ForwardModel):
     Attributes:
         grid: Bins, see ``Radar.grid``.
         surrogate: Kernels and extra widths, or a name among ``SURROGATES``.
-        sampling: How paths are sampled.
+        sampling: Sampling of paths.
         coherent: Names of coherent targets: smooth conductors of at most 24 triangles each, such as
             corner reflectors, whose bounces add in field. A smooth conductor that is not named
             is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
@@ -103,8 +103,8 @@ class SurrogateMap(ForwardModel):
         sensor: they may share tensors, or have objects of their own. See ``deposit_batch``.
 
         Args:
-            scenes: What is seen, such as the variants of one scene in a training step.
-            sensor: What sees each of them, with its poses.
+            scenes: Scenes to predict, such as the variants of one scene in a training step.
+            sensor: Radar that sees each of them, with its poses.
             seed: Same seed and scenes, same maps.
 
         Raises:
@@ -202,7 +202,7 @@ class ExactMap(ForwardModel):
 
     Attributes:
         grid: Bins, see ``Radar.grid``.
-        sampling: How paths are sampled.
+        sampling: Sampling of paths.
         speckle: Rough points and paths with their phases, which are unknown for real data; None =
             drawn from the seed.
     """
@@ -273,10 +273,10 @@ def surrogate_correlation(
     itself. A scene of conductors has no speckle: all its looks are equal.
 
     Args:
-        scene: What is seen.
+        scene: Scene to trace.
         radar: Arrays, waveform and poses.
         model: The surrogate; its ``sampling`` serves the exact spectra too.
-        seed: Of the first look, and of the surrogate's samples.
+        seed: Seed of the first look, and of the surrogate's samples.
         realisations: Exact spectra that are averaged.
 
     Returns:

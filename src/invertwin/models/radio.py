@@ -113,13 +113,13 @@ class RadioMap(ForwardModel):
     that levels and derivatives are finite where no path leads.
 
     Attributes:
-        places: Where receivers are.
-        propagation: How paths are found, and how they add up.
+        places: Positions of the receivers.
+        propagation: Settings of the path search and of the sum over paths.
         quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain``: the same as a ratio
             without a floor, ``sinr`` [dB]: received power of a transmitter over that of all others
             and noise, or ``delay_spread`` [s].
         floor_db: Path gain that is added to every one [dB].
-        noise_dbm: Of a receiver, for ``sinr`` [dBm].
+        noise_dbm: Noise power of a receiver, for ``sinr`` [dBm].
         scatter: Standard deviation of data about the map, in its unit, where it is known. Error
             bars and verdicts draw from it; None = as large as what a fit leaves unexplained.
         without: Names of objects that the model leaves out. In a first, coarse stage of a fit, what
@@ -151,9 +151,9 @@ class RadioMap(ForwardModel):
         """Gain and delay spread, before any decibels.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
-            seed: Of the rays that find paths.
+            scene: Propagation environment.
+            sensor: Transmitters.
+            seed: Seed of the rays that find paths.
 
         Raises:
             InputError: No object of a name that is left out.
@@ -212,8 +212,8 @@ class RadioMap(ForwardModel):
         """Number of the transmitter of which most power arrives; −1 where none arrives.
 
         Args:
-            scene: What is in the way.
-            sensor: What sends.
+            scene: Propagation environment.
+            sensor: Transmitters.
             seed: As for ``predict``.
         """
         gain = self.link_statistics(scene, sensor, seed).gain
@@ -261,9 +261,9 @@ class ResponseMap(ForwardModel):
     Maps hold real and imaginary parts; compare them by ``SpectrumLoss(levels=1, gain="one")``.
 
     Attributes:
-        positions: Of the receivers, [place, 3] [m].
-        frequencies: Of the responses [Hz].
-        propagation: How paths are found; its bandwidth does not count.
+        positions: Positions of the receivers, [place, 3] [m].
+        frequencies: Frequencies of the responses [Hz].
+        propagation: Settings of the path search; its bandwidth does not count.
         scatter: Standard deviation of data about the map, of each part; None = as large as what a
             fit leaves unexplained.
     """

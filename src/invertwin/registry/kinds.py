@@ -126,7 +126,7 @@ class KindGroup:
         default: The kind of a table without `tag`.
         points: The type of a list that may stand in place of a table.
         includes: Another group, whose kinds it has, too.
-        kinds: By name.
+        kinds: Kinds by name.
     """
 
     tag: str = "kind"
@@ -188,13 +188,13 @@ class Registry:
 
     Attributes:
         built_in: Modules whose ``register`` adds the library's own kinds.
-        sections: Of run files: dataclasses or pydantic models, by name.
-        commands: Of the command line: functions as typer takes them, by name; each is a task, too.
+        sections: Sections of run files: dataclasses or pydantic models, by name.
+        commands: Commands, as functions that typer takes, by name; each is a task, too.
         recordings: What `invertwin look` knows by the name of a file: the kind of its data, whose
             constructor gets the folder, and the preset that recorded, unless the user names
             another: the constructor then gets a `board`, too.
-        groups: Of kinds, by name.
-        forms: How values of a type of the library are written.
+        groups: Groups of kinds, by name.
+        forms: Written forms of values of the library's types.
         bases: A base of the tables of all constructors of a type or of its subclasses.
         given: Arguments of these types are no keys: they are handed over when a table is built.
     """
@@ -252,7 +252,7 @@ class Registry:
 
         Args:
             group: Its name.
-            base: Of its tables; None = the group's.
+            base: Base of its tables; None = the group's.
         """
         found, kinds = self._load_kinds()[group], self._kinds(group)
         if not kinds:
@@ -271,8 +271,8 @@ class Registry:
         """The table of a kind.
 
         Args:
-            group, name: Of the kind.
-            base: Of the table; None = the group's.
+            group, name: Group and name of the kind.
+            base: Base of the table; None = the group's.
         """
         found = self._load_kinds()[group]
         kind, base = self._kinds(group)[name], base or found.base
@@ -300,7 +300,7 @@ class Registry:
 
         Args:
             make: The constructor, or "module:name" of it. A pydantic model is taken as it is.
-            title: Of the table.
+            title: Title of the table.
             base: Its keys stand beside those of the arguments.
             fields: Further keys.
             without, checked: As in `add`.
@@ -361,7 +361,7 @@ class Registry:
 
         Args:
             hint: Annotation of the argument.
-            name: Of the argument.
+            name: Name of the argument.
         """
         origin, arguments, members = get_origin(hint), get_args(hint), _union_members(hint)
         form = next((self.forms[member] for member in members if member in self.forms), None)
@@ -403,9 +403,9 @@ class Registry:
         """Convert a value of the run file to the argument of the constructor.
 
         Args:
-            value: What was read.
+            value: Value that was read.
             hint: Annotation of the argument.
-            name: Of the argument.
+            name: Name of the argument.
             given: Values that no run file can hold, by their type.
         """
         if isinstance(value, ConstructorTable):

@@ -65,8 +65,8 @@ class KeyInputError(InputError):
     """Bad input at a key of the run file.
 
     Args:
-        path: Of the key.
-        text: What is wrong.
+        path: Path of the key.
+        text: Description of the fault.
     """
 
     def __init__(self, path: str, text: str) -> None:
@@ -89,9 +89,9 @@ def key(description: str, default: Any = ..., **limits: Any) -> Any:
     """A key of a table.
 
     Args:
-        description: What it means.
+        description: Meaning of the key.
         default: Its default; without one it is required.
-        limits: Of its value, as pydantic's ``Field`` takes them.
+        limits: Limits of its value, as pydantic's ``Field`` takes them.
     """
     return Field(default, description=description, **limits)
 
@@ -164,8 +164,8 @@ def check_presence(section: Section, wanted: dict[str, bool], when: str) -> None
 
     Args:
         section: The table.
-        wanted: By name, whether the key must be there or must not.
-        when: In which case, for the error.
+        wanted: For each name, whether the key must be there or must not.
+        when: Condition, for the error.
     """
     for name, needed in wanted.items():
         if needed != (getattr(section, name) is not None):
@@ -179,8 +179,8 @@ def require_section(run: Any, section: str, command: str, otherwise: str = "add 
     Args:
         run: The run file.
         section: Name of the section.
-        command: Which needs it, for the error.
-        otherwise: What to do without it, for the error.
+        command: Command that needs it, for the error.
+        otherwise: Remedy without it, for the error.
 
     Raises:
         InputError: The run file does not have it; the message ends with `otherwise`.
@@ -200,8 +200,8 @@ def raise_key_error(text: str, path: str = "") -> NoReturn:
     """Raise an error of the run file.
 
     Args:
-        text: What is wrong.
-        path: Of the key; without it the error is of the whole section.
+        text: Description of the fault.
+        path: Path of the key; without it the error is of the whole section.
     """
     raise PydanticCustomError("section", "{text}", {"text": text, "path": path})
 
@@ -212,8 +212,8 @@ def suggest_name(given: str, allowed: Sequence[str], otherwise: str, cutoff: flo
     Args:
         given: The name.
         allowed: Names that there are.
-        otherwise: What to do where none is alike.
-        cutoff: From which similarity on names are alike, up to 1.
+        otherwise: Remedy where none is alike.
+        cutoff: Least similarity of names that are alike, up to 1.
     """
     close = difflib.get_close_matches(given, allowed, n=1, cutoff=cutoff)
     return f"did you mean `{close[0]}`?" if close else otherwise

@@ -135,12 +135,11 @@ def select_libllvm(folders: Sequence[Path] | None = None, probe: _Probe | None =
     """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM that passes, before Dr.Jit is imported.
 
     ``import invertwin`` calls it. It never raises: when nothing passes, :func:`require_backend`
-    raises as
-    soon as rays are needed. A path set by the user is kept if it passes, and replaced with a
-    warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
+    raises as soon as rays are needed. A path set by the user is kept if it passes, and replaced
+    with a warning if not. Nothing is done when ``INVERTWIN_BACKEND=cuda``, nor on a second call.
 
     Args:
-        folders: Where to look, instead of the places known to hold libLLVM.
+        folders: Folders to search, instead of the places known to hold libLLVM.
         probe: Judges one path, instead of :func:`probe_library`.
     """
     global _choice

@@ -24,9 +24,7 @@ def progress_callback(callback: Callable[[str, int, int, float], None]) -> Gener
     """Hear how far long loops have come while the block is worked on.
 
     Args:
-        callback: Takes what is worked on, how many parts of it are done, how many there are, and
-            the
-            time that is left [s].
+        callback: Function (name of the work, parts done, parts in all, time left [s]).
     """
     token = _listener.set(_ProgressListener(callback))
     try:
@@ -39,8 +37,8 @@ def track(parts: Collection[_T], name: str) -> Generator[_T]:
     """Go through parts of some work, and tell how many are done; loops inside keep silent.
 
     Args:
-        parts: What there is to do.
-        name: What is worked on, for people.
+        parts: Parts of the work.
+        name: Name of the part in progress, for people.
     """
     listener = _listener.get()
     if listener is None or listener.busy:

@@ -28,7 +28,7 @@ Faces: TypeAlias = Int64[np.ndarray, "f 3"]
 Numbers: TypeAlias = Int64[np.ndarray, " n"]
 Groups: TypeAlias = Int64[np.ndarray, " v"]
 Owner: TypeAlias = Int64[np.ndarray, " f"] | int  # object of each triangle
-_LINE = 0.8191, 0.4731, 0.3244  # a direction across no planes that people draw
+_LINE = 0.8191, 0.4731, 0.3244  # normal to no plane that is usual in models
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
 _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MAX_CRACK_SHARE = 1e-3  # of the edges on both sides: width of the widest cracks that are closed
@@ -42,12 +42,12 @@ class Cracks(NamedTuple):
     """Vertices that move onto edges, so that cracks close, and what stays open.
 
     Attributes:
-        vertex: number of each of them.
-        row: which of these each weight is of.
-        column: vertex that has the weight.
-        weight: shares of vertices in the new position.
+        vertex: indices of the vertices that move.
+        row: index in ``vertex`` of the vertex that each weight belongs to.
+        column: vertex whose position each weight multiplies.
+        weight: weights of the new positions, which are weighted sums of old ones.
         open_edges: number of open edges that run beside others, across cracks too wide to close.
-        width: of the widest of these, in units of the size of the group.
+        width: width of the widest of these cracks, in units of the size of the group.
     """
 
     vertex: Numbers
@@ -61,15 +61,17 @@ class Cracks(NamedTuple):
 def close_cracks(
     points: Points, faces: Faces, groups: Groups | None = None, owner: Owner = 0
 ) -> tuple[Faces, MeshEdges, Points, Cracks]:
-    """Weld vertices and close cracks: triangles, edges, positions, and what closes the cracks.
-
-    Positions are in units of the size of their group, vertices where they have moved.
+    """Weld vertices and close cracks.
 
     Args:
         points: positions [m].
         faces: vertices of each triangle.
         groups: group of each vertex, from 0; only those of one group are welded. None = one.
         owner: object of each triangle.
+
+    Returns:
+        Welded triangles, edges, positions after the moves in units of the size of their group, and
+        the moves that close the cracks.
     """
     groups = np.zeros(len(points), dtype=np.int64) if groups is None else groups
     places = separate_groups(points, groups)
@@ -358,9 +360,11 @@ def merge_doubled_sides(edges: MeshEdges, places: Points, owner: Owner = 0) -> M
 def _sort_around_edges(
     edges: MeshEdges, places: Points, least: int = 3
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """Sort the half edges at edges of some and more by angle: number, edge and half plane.
+    """Sort the half edges at edges with ``least`` or more of them by angle about the edge.
 
-    Half planes are numbered in the order of the angle, one edge after the other.
+    Returns:
+        Number, edge and half plane of each; half planes are numbered in the order of the angle, one
+        edge after the other.
     """
     edge = np.repeat(np.arange(len(edges.counts)), edges.counts)
     side = np.flatnonzero((edges.counts >= least)[edge])

@@ -56,8 +56,8 @@ def checked_angles(
     Args:
         theta: angles to boresight, from 0 to π at most.
         phi: angles around boresight, which span less than 2π.
-        of: what the table is of, for the message.
-        do: what the user can do about wrong shapes, for the message.
+        of: noun for the owner of the table, for the message.
+        do: remedy for wrong shapes, for the message.
 
     Raises:
         InputError: angles that do not ascend or are out of range.

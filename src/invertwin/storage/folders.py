@@ -79,7 +79,7 @@ def foreign_file_error(path: Path, name: str) -> InputError:
     """The error of a file in the way that no run has written.
 
     Args:
-        path: Of the folder.
+        path: Path of the folder.
         name: Path in the folder.
     """
     return InputError(
@@ -92,7 +92,7 @@ def lock_folder(path: Path, stack: ExitStack) -> None:
     """Lock a folder until the stack is closed, or the process dies.
 
     Args:
-        path: Of the folder.
+        path: Path of the folder.
         stack: Keeps the lock.
     """
     file = path / LOCK
@@ -136,8 +136,8 @@ def save_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest, the old or the new one whole.
 
     Args:
-        path: Of the folder.
-        manifest: What it holds.
+        path: Path of the folder.
+        manifest: Content of the manifest.
     """
     with replace_file(path / MANIFEST) as part:
         part.write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
@@ -147,7 +147,7 @@ def path_in_folder(path: Path, name: str) -> Path:
     """A file in the folder, if its name is plain: it does not lead elsewhere, nor do links.
 
     Args:
-        path: Of the folder.
+        path: Path of the folder.
         name: Path in the folder.
     """
     parts = PurePosixPath(name).parts
@@ -178,7 +178,7 @@ def require_free(path: Path, name: str, replaceable: Iterable[str]) -> None:
     """Refuse a name at which something lies that is no file of our own.
 
     Args:
-        path: Of the folder.
+        path: Path of the folder.
         name: Path in the folder.
         replaceable: Names of files that may be replaced.
     """
@@ -191,8 +191,8 @@ def move_results(path: Path, manifest: Manifest) -> Manifest:
     """Put the files of a complete run in their places; go on where a kill has cut it short.
 
     Args:
-        path: Of the folder.
-        manifest: What it holds.
+        path: Path of the folder.
+        manifest: Content of the manifest.
     """
     work = manifest.unfinished
     assert work is not None
@@ -211,8 +211,8 @@ def remove_unfinished(path: Path, manifest: Manifest) -> Manifest:
     """Remove what an unfinished run has left.
 
     Args:
-        path: Of the folder.
-        manifest: What it holds.
+        path: Path of the folder.
+        manifest: Content of the manifest.
     """
     if manifest.unfinished is None:
         return manifest

@@ -52,8 +52,8 @@ class StoredArrays(NamedTuple):
     """Arrays and attributes of a file.
 
     Attributes:
-        arrays: By name.
-        attributes: Of the file.
+        arrays: Arrays by name.
+        attributes: Attributes of the file.
     """
 
     arrays: dict[str, StoredArray]
@@ -71,8 +71,8 @@ def read_isolated(
 
     Args:
         path: The file.
-        kind: What it should be. Files of MATLAB 7.3 are HDF5 inside.
-        variable: Which is read; NetCDF files are read as a whole.
+        kind: Expected format. Files of MATLAB 7.3 are HDF5 inside.
+        variable: Variable to read; NetCDF files are read as a whole.
         trusted: Read it in this process, which is faster by about a second.
 
     Raises:
@@ -117,9 +117,9 @@ def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: 
     """Read a file within limits in the child process, and write its arrays.
 
     Args:
-        kind: Of the file.
+        kind: Kind of the file.
         path: The file.
-        variable: Which is read.
+        variable: Variable to read.
         memory: Address space [bytes].
         seconds: Processor time [s].
     """

@@ -33,12 +33,12 @@ class RunFolder:
     keeps what can be resumed, or leaves no trace. An OSError becomes an InputError.
 
     Attributes:
-        path: Where the results are in the end.
+        path: Final folder of the results.
         complete: Whether the run had ended before it was opened again.
 
     Args:
-        path: Of the folder.
-        manifest: What it holds.
+        path: Path of the folder.
+        manifest: Content of the manifest.
         stack: Its lock.
     """
 
@@ -95,7 +95,7 @@ class RunFolder:
 
         Args:
             name: Its path in the folder.
-            data: What it holds.
+            data: Content of the file.
         """
         with folders.replace_file(self.file(name)) as part:
             part.write_bytes(data)
@@ -105,7 +105,7 @@ class RunFolder:
 
         Args:
             name: Its path in the folder.
-            text: What it holds.
+            text: Content of the file.
         """
         self.write_bytes(name, text.encode("utf-8"))
 
@@ -114,7 +114,7 @@ class RunFolder:
 
         Args:
             name: Its path in the folder.
-            value: What it holds.
+            value: Content of the file.
         """
         text = json.dumps(to_json_value(value), indent=2, ensure_ascii=False, allow_nan=False)
         self.write_text(name, text + "\n")

@@ -38,8 +38,8 @@ def convert_read_errors(
 
     Args:
         path: The file.
-        expected: What it should be, such as "a readable .ply mesh".
-        do: What the user can do.
+        expected: Noun for the expected content, such as "a readable .ply mesh".
+        do: Remedy.
 
     Raises:
         InputError: The reader has raised something.
@@ -73,8 +73,8 @@ def safe_reader(
     `convert_read_errors`.
 
     Args:
-        expected: What the file should be.
-        do: What the user can do.
+        expected: Noun for the expected content.
+        do: Remedy.
     """
 
     def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -94,7 +94,7 @@ def existing_file(path: str | Path, what: str = "an existing file") -> Path:
 
     Args:
         path: The file.
-        what: What it should be, for the error.
+        what: Noun for the expected content, for the error.
 
     Raises:
         InputError: No such file, a name that cannot be one, an empty file, or one of holes.
@@ -164,7 +164,7 @@ def read_text(path: str | Path, what: str) -> str:
 
     Args:
         path: The file.
-        what: What it should be, for the error.
+        what: Noun for the expected content, for the error.
 
     Raises:
         InputError: No such file, or one that is no text.
@@ -208,7 +208,7 @@ def read_arrays(
 
     Args:
         path: The file.
-        do: What the user can do where it cannot be read, for the message.
+        do: Remedy where it cannot be read, for the message.
         names: Names; None = all.
 
     Raises:

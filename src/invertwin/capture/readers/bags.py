@@ -34,7 +34,7 @@ class BagMessages:
 
     Attributes:
         times: When each was stamped, or else recorded, since 1970 [s].
-        values: What the field holds, an array a message.
+        values: Values of the field, one array per message.
     """
 
     times: Float64[Tensor, " message"]

@@ -68,7 +68,7 @@ def from_openradar(adc_data: _Pulses, transmitters: int, order: _Order = None) -
 
     Args:
         adc_data: OpenRadar's [frames, chirps, receivers, samples].
-        transmitters: How many take turns.
+        transmitters: Number of transmitters that take turns.
         order: As in ``to_openradar``.
 
     Raises:

@@ -148,7 +148,7 @@ def write_chirps(
 
     Args:
         path: the TOML file.
-        data: what to write; real samples are written as real numbers.
+        data: data to write; real samples are written as real numbers.
         file: name of the data file beside it; its ending says the format: .npy, .npz, .h5, .hdf5
             or .mat (MATLAB 5).
         arrays: TX and RX elements, written as positions; their patterns are not.
@@ -196,9 +196,9 @@ def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
     """Elements that a description lists.
 
     Args:
-        positions: of the elements [m].
-        name: of the array, for the error.
-        axes: of the description, see `load_description`.
+        positions: positions of the elements [m].
+        name: name of the array, for the error.
+        axes: axes of the description, see `load_description`.
 
     Raises:
         InputError: no points.

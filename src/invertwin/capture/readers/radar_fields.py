@@ -89,7 +89,7 @@ def convert_old_axes(dataset: xr.Dataset) -> xr.Dataset:
     """The dataset with x forward, y left, z up: positions become P p, rotations P R Pᵀ.
 
     Args:
-        dataset: of a file; one that states its axes stays as it is.
+        dataset: dataset of a file; one that states its axes stays as it is.
     """
     if "axes" in dataset.attrs:
         return dataset
@@ -222,7 +222,7 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Write a dataset, complex variables as two real ones. The file is complete or not there.
 
     Args:
-        dataset: what to write.
+        dataset: data set to write.
         path: file; an old one is replaced.
 
     Raises:

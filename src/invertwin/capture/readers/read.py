@@ -28,7 +28,7 @@ def read(
 
     Args:
         path: the file.
-        settings: of a `.bin`, or their file: `.cfg` or `.mmwave.json`.
+        settings: settings of a `.bin`, or their file: `.cfg` or `.mmwave.json`.
         board: whose elements recorded, or (transmitters, receivers), see `ChirpData.recorded`;
             None = as the description says.
         lanes: lanes of the LVDS link, where the settings do not say.

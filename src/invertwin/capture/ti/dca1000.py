@@ -80,7 +80,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
 
     Args:
         path: `.bin` file, or the files of one recording in their order.
-        settings: what it was set up with; `lanes` must be known.
+        settings: settings of the recording; `lanes` must be known.
 
     Raises:
         InputError: no file, an odd number of bytes, less than one frame, or a size that the
@@ -208,7 +208,7 @@ def _find_alternatives(
     """Other settings that the file speaks for, best first; none = it may be as stated.
 
     Args:
-        words: Of the file.
+        words: Words of the file.
         settings: As stated.
         exact: Whether the size is that of the settings.
         truncated: Whether it is that of a recording that was stopped.

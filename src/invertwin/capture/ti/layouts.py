@@ -43,10 +43,9 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
     """Settings with some numbers replaced.
 
     Args:
-        settings: What the file says.
-        changes: By the names in ``CHANGEABLE_SETTINGS``; numbers of receivers and transmitters
-            mean the first
-            ones.
+        settings: Settings as the file states them.
+        changes: Values by the names in ``CHANGEABLE_SETTINGS``; numbers of receivers and
+            transmitters mean the first ones.
 
     Raises:
         InputError: Another name, or values that settings cannot have.
@@ -71,9 +70,8 @@ class LayoutEvidence:
         border_ratio: Failure of prediction at the quietest borders over the largest anywhere
             within:
             above 1 for the right blocks where there is an echo; below for others.
-        code_length: Length of a code of the samples by their predictions, but for a constant
-            [nats a
-            word]. Wrong blocks, and samples in a wrong order, are predicted worse.
+        code_length: Length of a code of the samples by their predictions, up to a constant
+            [nats per word]. Wrong blocks, and samples in a wrong order, are predicted worse.
     """
 
     border_ratio: float
@@ -93,9 +91,9 @@ class LayoutCandidate:
     """Settings with which the size of a file is exact.
 
     Attributes:
-        changes: What is changed.
-        settings: With the changes.
-        evidence: Of the samples.
+        changes: Changed settings.
+        settings: Settings with the changes.
+        evidence: Evidence of the samples.
         coherence: Coherence of blocks that the settings give to one channel; None = the file is too
             short.
     """
@@ -147,8 +145,9 @@ def find_candidates(words: np.ndarray, settings: ChirpSettings) -> list[LayoutCa
     A ramp holds the samples, the period of frames holds the ramps.
 
     Args:
-        words: Of the file.
-        settings: That contradict it. Without a number of frames, any number of whole ones fits.
+        words: Words of the file.
+        settings: Settings that contradict it. Without a number of frames, any number of whole ones
+            fits.
 
     Returns:
         Those whose blocks break at their borders first, the cheapest before others; with the same
@@ -251,8 +250,8 @@ def measure_evidence(words: np.ndarray, settings: ChirpSettings) -> LayoutEviden
     counts: blocks that are cut in two have borders without a break.
 
     Args:
-        words: Of the file.
-        settings: Of which the layout counts.
+        words: Words of the file.
+        settings: Settings whose layout counts.
     """
     rows = sample_rows(words, settings)
     count = settings.samples
@@ -286,8 +285,8 @@ def block_coherence(words: np.ndarray, settings: ChirpSettings) -> float | None:
     """Coherence of blocks after as many as there are channels, which is that of one channel's.
 
     Args:
-        words: Of the file.
-        settings: How many channels take turns.
+        words: Words of the file.
+        settings: Settings with the numbers of channels.
     """
     rows = sample_rows(words, settings)
     count, turns = settings.samples, _block_period(settings)
@@ -303,7 +302,7 @@ def sample_rows(words: np.ndarray, settings: ChirpSettings) -> Complex128[Tensor
     """Samples in the order of the stream: one row, or one a lane where receivers are side by side.
 
     Args:
-        words: From the start of a file.
+        words: Words from the start of a file.
         settings: Their lanes, and whether samples are real.
     """
     s, parts = settings, 1 if settings.real else 2
@@ -325,8 +324,8 @@ def better_candidates(
     """Candidates of whose blocks the samples speak, against those that are stated.
 
     Args:
-        found: Of ``candidates``.
-        stated_evidence: Of the settings as they are.
+        found: Result of ``candidates``.
+        stated_evidence: Evidence of the settings as they are stated.
     """
     if stated_evidence.breaks_at_borders:
         return []
@@ -339,7 +338,7 @@ def silent_lanes_contradict(words: np.ndarray, settings: ChirpSettings) -> bool:
     """Return True if lanes of receivers that are not stated hold samples.
 
     Args:
-        words: Of the file.
+        words: Words of the file.
         settings: As stated.
     """
     return settings.lanes == LANE_COUNT and not set(_active_lanes(words)) <= set(settings.receivers)
@@ -349,7 +348,7 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     """List the layouts that fit, best first, and say if the samples decide between them.
 
     Args:
-        found: Of ``candidates``.
+        found: Result of ``candidates``.
     """
     best, own = found[0].evidence, block_layout(found[0].settings)
     rivals = [one.evidence for one in found if block_layout(one.settings) != own]

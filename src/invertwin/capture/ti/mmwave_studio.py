@@ -155,7 +155,7 @@ def _list_items(written: Any, key: str) -> list[dict[str, Any]]:
 
     Args:
         written: A list, an item, or an object of items.
-        key: What every item has.
+        key: Key that every item has.
     """
     if isinstance(written, dict):
         written = [written] if key in written else list(written.values())
@@ -178,7 +178,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
 
     Args:
         path: file to write.
-        chirp_settings: what to write.
+        chirp_settings: settings to write.
 
     Raises:
         InputError: the folder does not exist, or settings without a number of lanes.

@@ -163,7 +163,7 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
 
     Args:
         path: file to write.
-        chirp_settings: what to write.
+        chirp_settings: settings to write.
 
     Raises:
         InputError: the folder does not exist.

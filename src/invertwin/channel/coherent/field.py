@@ -37,9 +37,9 @@ def trace_field(
     """Field paths: physical optics for conductors, fixed random-phase points for rough surfaces.
 
     Args:
-        scene: What is seen.
+        scene: Scene to trace.
         link: Antennas, per frame.
-        sampling: How many paths are drawn. From conductor to conductor they are mirrored, every
+        sampling: Numbers of paths. From conductor to conductor they are mirrored, every
             bounce in phase; between other surfaces every ordered path has a fixed phase, and
             conductors scatter by their lobe.
         seed: Places and phases.
@@ -191,7 +191,7 @@ def rough_path_matrix(
     Args:
         link: Antennas.
         echo: The radar equation of the paths.
-        phase: of the paths.
+        phase: phase of the paths.
     """
     rotation = link.rotations[echo.frame]
 

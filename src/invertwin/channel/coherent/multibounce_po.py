@@ -39,7 +39,7 @@ def trace_multibounce_paths(rays: RayScene, sampling: Sampling, seed: int) -> li
     Args:
         rays: The scene and its antennas.
         sampling: Number of rays per frame, most bounces.
-        seed: Where rays meet the first conductor.
+        seed: Seed of the points where rays meet the first conductor.
 
     Source: derivations §13.
 
@@ -141,9 +141,9 @@ def sample_surface_points(areas: Float64[Tensor, " f"], count: int, seed: int) -
     """Low-discrepancy points over triangles (error of an integral: 1/count).
 
     Args:
-        areas: of the triangles; those of none get no point.
-        count: of the points.
-        seed: of their places.
+        areas: areas of the triangles; those of none get no point.
+        count: number of points.
+        seed: seed of their positions.
     """
     rng = np.random.default_rng(seed)
     shift = rng.random(2)

@@ -40,7 +40,7 @@ class ProjectedSilhouettes:
 
     Attributes:
         frame, face: Radar pose, and the triangle the shadow falls on.
-        b1, b2: Where on the triangle.
+        b1, b2: Barycentric coordinates on the triangle.
         point: Place where the shadow falls, detached.
         area_rate: Area newly lit per unit of θ, over the probability of the sample: attached, and
             zero in derivative where the other antenna does not see the point.
@@ -133,9 +133,9 @@ def trace_power(scene: Scene, link: Link, *, sampling: Sampling, seed: int) -> P
     velocities of the objects.
 
     Args:
-        scene: What is seen.
+        scene: Scene to trace.
         link: Antennas, per frame.
-        sampling: How many paths are drawn.
+        sampling: Numbers of paths.
         seed: Same seed, same paths.
 
     Raises:

@@ -99,7 +99,7 @@ class PathTransfer:
         """Paths of one kind.
 
         Args:
-            kind, given: See ``make_paths``.
+            kind, given: Arguments of ``make_paths``.
         """
         delay, ends = self.length / SPEED_OF_LIGHT, (self.points[0], self.points[-1])
         return make_paths(
@@ -141,7 +141,7 @@ def radar_equation(
         for point, back, on in turns
     )
     arriving = math.prod(earlier, start=(link.wavelength / (4 * torch.pi)) ** 2 * spread)
-    turned = []  # χ of what is scattered; what passes through a skin keeps its polarisation
+    turned = []  # χ of what is scattered; refraction keeps the polarisation
     for point, back, on in turns:
         same_side = (point.normal * -back).sum(1) * (point.normal * on).sum(1) > 0
         turned.append(torch.where(same_side, geometry.surfaces.depolarisation[point.row], 0.0))
@@ -154,14 +154,14 @@ def evaluate_scattering(
 ) -> Tensor:
     """``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
-    On one side, ``f`` is the distribution of ``scene.material``; through the skin of a body, see
-    ``ScatteringLawTables.refracted``.
+    On one side, ``f`` is the distribution of ``scene.material``; through the interface of a body,
+    see ``ScatteringLawTables.evaluate_refraction``.
 
     Args:
         geometry: The scene.
-        point: Where on it.
-        incident: To where the path comes from.
-        outgoing: To where it goes on.
+        point: Point on it.
+        incident: Unit directions to the previous vertex.
+        outgoing: Unit directions to the next vertex.
     """
     surfaces, row, normal = geometry.surfaces, point.row, point.normal
     pairs = (normal, incident), (normal, outgoing), (incident, outgoing)
@@ -200,7 +200,7 @@ def evaluate_scattering(
 
 
 def _outer_cosine(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine on the outer side of a skin (Snell), and whether there is none."""
+    """Cosine on the outer side of an interface (Snell), and whether there is none."""
     if not geometry.has_refracting_bodies:
         return cosine, torch.zeros_like(cosine, dtype=torch.bool)
     inside = cosine < 0

@@ -43,16 +43,16 @@ class Geometry:
         faces: Vertex indices of all triangles.
         face_object: Index of the object of each triangle.
         face_surface: Row of each triangle in the tables of surfaces.
-        surfaces: What surfaces do, one row per material, or per triangle where its values differ.
-        has_lobe: Which lobes have weight, or a derivative that could give them some.
+        surfaces: Scattering laws, one row per material, or per triangle where its values differ.
+        has_lobe: For each lobe, True if it has weight, or a derivative that could give it some.
         has_sheets: Whether something passes straight through any surface.
-        has_refracting_bodies: Whether any surface is the skin of a refracting body.
+        has_refracting_bodies: Whether any surface is the interface of a refracting body.
         has_spread: Whether any specular lobe lacks what is mirrored.
-        names: Of the objects.
+        names: Names of the objects.
         coherent: Per object, whether its field paths have a deterministic phase.
         differentiated: Per object, whether derivatives flow through its place or its shape.
         shape_differentiated: Per object, whether they flow through its shape.
-        topology: What depends on the connectivity only.
+        topology: Tables that depend on the connectivity only.
         velocities: World velocities of the vertices [m/s]; None = all at rest.
         object_scene: Per object, the scene that it belongs to, where several stand apart (see
             ``rays.batching``); None = one scene.
@@ -123,7 +123,7 @@ def require_silhouette_samples(geometry: Geometry, link: Link, samples: int) -> 
     Args:
         geometry: The scene.
         link: Antennas.
-        samples: How many there are.
+        samples: Number of silhouette samples.
 
     Raises:
         InputError: Silhouettes move and there are no samples of them.

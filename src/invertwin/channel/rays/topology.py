@@ -37,7 +37,7 @@ class Topology:
     Args:
         faces: Vertex indices of all triangles; those of closed objects are turned outwards.
         vertex_object: Object of every vertex, in ascending order.
-        vertices: In the objects' own frames, or in the world where objects share edges.
+        vertices: Positions in the objects' own frames, or in the world where objects share edges.
         groups: Group of each object, within which vertices at one place count as one.
     """
 

@@ -33,7 +33,7 @@ class DiscontinuityCurves:
     """Straight pieces of the curves at which what is seen may jump; detached.
 
     Attributes:
-        start, end: Of the pieces [m].
+        start, end: Start and end of the pieces [m].
         first, second: Edges: vertices at the ends. Crossings: the two triangles.
         is_intersection: Whether it is a crossing.
     """
@@ -53,7 +53,7 @@ class ViewpointScene:
         viewpoint: [3] in the world [m].
 
     Attributes:
-        names: Of the objects.
+        names: Names of the objects.
         face_object: Number of the object of each triangle.
 
     Raises:
@@ -78,7 +78,7 @@ class ViewpointScene:
         """The triangle that each ray from the place meets first (−1: none).
 
         Args:
-            directions: In the world, of any length.
+            directions: Directions in the world, of any length.
         """
         if not len(directions):
             return torch.zeros(0, dtype=torch.int64)
@@ -142,8 +142,8 @@ class ViewpointScene:
         """Points of curves, attached: they move with the edge, or with the planes that cross.
 
         Args:
-            curves: From ``outlines`` or ``crossings``.
-            piece: Of them.
+            curves: Curves from ``outlines`` or ``crossings``.
+            piece: Index of a piece of the curves.
             fraction: Place from the start to the end of the piece, 0 to 1.
         """
         first, second = curves.first[piece], curves.second[piece]

@@ -58,11 +58,11 @@ def dataset(
 
     Args:
         run_file: The run file (TOML).
-        folder: For the shards; each part has a folder of its own inside.
+        folder: Folder of the shards; each part has a folder of its own inside.
         workers: Processes of one thread each.
         engine: ``processes`` of this machine, or tasks of a ``ray`` cluster.
         part: Number from 1, and how many parts there are: part i of n makes every n-th shard.
-        seed: In place of the run file's.
+        seed: Seed instead of the run file's.
         overwrite: Replace the results in the folder when this run ends.
         resume: Go on with the interrupted run in the folder.
 

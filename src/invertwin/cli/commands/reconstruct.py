@@ -50,9 +50,9 @@ def run_reconstruct(
 
     Args:
         run: The run file.
-        folder: For the results.
+        folder: Folder of the results.
         console: Shows progress.
-        workers: Who fits; None = this process, one start after another.
+        workers: Processes that fit; None = this process, one start after another.
         view: Show the fits in a browser while they go on.
 
     Raises:

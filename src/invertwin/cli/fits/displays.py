@@ -95,7 +95,7 @@ def steps_path(checkpoint: str) -> str:
     """The path in the run's folder at which the steps of a fit are kept.
 
     Args:
-        checkpoint: That of the fit.
+        checkpoint: Checkpoint of the fit.
     """
     return f"{PARTS}/{Path(checkpoint).stem}_steps.npz"
 
@@ -104,7 +104,7 @@ def load_steps(file: Path) -> list[viewer.DisplayStep]:
     """The steps that a fit has kept.
 
     Args:
-        file: Of `StepRecorder`.
+        file: File of `StepRecorder`.
     """
     return list(viewer.Display.load(file).steps) if file.is_file() else []
 
@@ -136,7 +136,7 @@ def placement_layers(coverage: Coverage, panel: Metasurface) -> list[viewer.Disp
     """Layers of a metasurface that is placed: antennas, cells, and paths to some receivers.
 
     Args:
-        coverage: Of the receivers.
+        coverage: Coverage of the receivers.
         panel: The metasurface where it stands.
     """
     settings = PropagationSettings(coverage.frequency, 0.0, depth=1, panels=[panel])
@@ -150,7 +150,7 @@ def make_sensor_maps(
     """Maps of the sensors of a fit, by their names.
 
     Args:
-        problem: What is fitted.
+        problem: Problem to fit.
         spectra: Power [frame, range, u, v] of every sensor, by what is shown.
         max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
@@ -167,8 +167,8 @@ def make_start_display(problem: Problem, start: Start) -> viewer.Display:
     """A display of a fit that has not begun, with the measured maps and those of the start.
 
     Args:
-        problem: What is fitted.
-        start: Of the first fit.
+        problem: Problem to fit.
+        start: Start of the first fit.
     """
     display = make_problem_display(problem, start.scene)
     sensors = [item.sensor for item in problem.sensor_data.values()]
@@ -181,7 +181,7 @@ def make_problem_display(problem: Problem, scene: Scene) -> viewer.Display:
     """A display of a fit: its objects, the truth where it is known, the radars.
 
     Args:
-        problem: What is fitted.
+        problem: Problem to fit.
         scene: The start or the twin.
     """
     names = [name for name in problem.run.fitted_objects if name in scene.names]
@@ -195,6 +195,6 @@ def radar_data(problem: Problem) -> dict[str, SensorData]:
     """The data of radars, which a viewer can show, by the sensor's name.
 
     Args:
-        problem: What is fitted.
+        problem: Problem to fit.
     """
     return {name: item for name, item in problem.sensor_data.items() if item.grid is not None}

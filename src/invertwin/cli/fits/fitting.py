@@ -55,7 +55,7 @@ def fit_all(
     """Fit from every start in every method; fits that are in the folder are not made again.
 
     Args:
-        problem: Of the run.
+        problem: Problem of the run.
         folder: Keeps results and checkpoints.
         console: Shows progress.
         show: Is told of steps as they come.
@@ -168,7 +168,7 @@ def run_fit(
     """Make one fit, or read what an interrupted run has kept of it.
 
     Args:
-        problem: Of the run.
+        problem: Problem of the run.
         start: Initial values.
         index: Number of the start.
         mode: The run's own way to fit, a variant, or one of the data.
@@ -285,7 +285,7 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
     """The problem with range bias and clock offset found on an object whose position is known.
 
     Args:
-        problem: Of one radar.
+        problem: Problem of one radar.
         folder: Keeps the checkpoint.
         console: Shows progress.
 

@@ -47,9 +47,9 @@ class SensorData:
 
     Attributes:
         recording: As the forward model observes it.
-        sensor: What recorded it.
+        sensor: Sensor that recorded it.
         grid: Bins of its maps; None where the model needs none.
-        weight: Of its loss in the mean.
+        weight: Weight of its loss in the mean.
     """
 
     recording: Any
@@ -80,10 +80,10 @@ class Problem:
         scene: As known.
         truth: As it is, where the run file knows it.
         known_objects: Objects whose true pose is known.
-        sensor_data: By the sensor's name.
+        sensor_data: Data by the sensor's name.
         scored_object: The object that is scored.
         kind: Kind of the data.
-        reference: What scores need beside the truth: true transmitters, other receivers.
+        reference: Further references of the scores: true transmitters, other receivers.
         notes: Numbers of what came before the fits, for metrics.json.
     """
 
@@ -129,13 +129,13 @@ class Fits:
     """All fits of a run.
 
     Attributes:
-        problem: With the data of the best fit.
-        rows: Of every fit, by method.
+        problem: Problem with the data of the best fit.
+        rows: Rows of every fit, by method.
         outcome: Outcome of a fit that is no variant, by method and number of its start.
         best: Row of the best one, of the run's own method.
-        start: Where it began.
-        found: What it found.
-        maps: Of every sensor, by "measured", "start" and "twin"; empty where none is shown.
+        start: Start of the best fit.
+        found: Result of the best fit.
+        maps: Maps of every sensor, by "measured", "start" and "twin"; empty where none is shown.
     """
 
     problem: Problem
@@ -166,10 +166,10 @@ class Summary:
     """A part of the report that depends on the kind of data.
 
     Attributes:
-        outcome: In a sentence or two.
+        outcome: Outcome in a sentence or two.
         result: Table of the result.
         pictures: Below it.
-        tables: At the end.
+        tables: Tables at the end of the report.
     """
 
     outcome: str
@@ -189,7 +189,7 @@ class DataKind(ABC):
     """A kind of data: how it is read, modelled, scored and shown. All else is the same for all.
 
     Attributes:
-        title: Of a report without one.
+        title: Title of a report without one.
         unused: Sections that have no meaning for such data.
         methods: Further fits beside those of the run and its variants.
         histories: Keys of rows that metrics.json leaves out.
@@ -254,9 +254,9 @@ class DataKind(ABC):
         """One parameter of the run file.
 
         Args:
-            problem: Of the fit.
-            name: Of the parameter.
-            table: Of the parameter.
+            problem: Problem of the fit.
+            name: Name of the parameter.
+            table: Table of the parameter.
             start: Initial values.
         """
         make = build.module_builders(problem.run.parameters, problem.run.scene)[name]
@@ -299,7 +299,7 @@ def make_observations(problem: Problem, start: Start | None = None) -> list[Obse
     """Observations of a fit: data, model, and what is unknown of the sensor.
 
     Args:
-        problem: Of a mode.
+        problem: Problem of a mode.
         start: Initial values; None = the scene as known.
     """
     kind, begun = problem.kind, start or Start(problem.scene)
@@ -321,7 +321,7 @@ def make_unknowns(problem: Problem, start: Start | None = None) -> dict[str, Unk
     """Unknowns of the scene, by name.
 
     Args:
-        problem: Of a mode.
+        problem: Problem of a mode.
         start: Initial values; None = the scene as known.
     """
     return _build_unknowns(problem, start or Start(problem.scene), of_sensors=False)

@@ -63,8 +63,8 @@ def record_sensors(
 
     Args:
         run: The run file.
-        sensors: By name.
-        truth: What they record.
+        sensors: Sensors by name.
+        truth: Scene that they record.
         console: Shows progress.
     """
     found = {}
@@ -84,8 +84,8 @@ def with_new_recording(problem: Problem, number: int, console: Console) -> Probl
     """The problem with another recording of the same scene, from simulated data.
 
     Args:
-        problem: With its own recording.
-        number: Of the recording.
+        problem: Problem with its own recording.
+        number: Number of the recording.
         console: Shows progress.
     """
     run, data = problem.run, problem.run.data
@@ -101,7 +101,7 @@ def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> N
 
     Args:
         run: The run file.
-        sensors: By name.
+        sensors: Sensors by name.
     """
     for name, sensor in sensors.items():
         data, depth = sensor.run.data, run.fit_settings.depth

@@ -204,7 +204,7 @@ def radio_map(run: RunFile, points: ReceiverPoints | None) -> RadioMap:
 
     Args:
         run: The run file of a method or a stage.
-        points: In place of those of ``[map]``, where the data bring their own.
+        points: Points instead of those of ``[map]``, where the data bring their own.
     """
     with prefix_errors("map"):
         found = require_section(run, "map", "received levels").build()
@@ -281,7 +281,7 @@ def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[s
 
     Args:
         run: The run file.
-        rows: Of all starts.
+        rows: Rows of all starts.
         best: One of them.
         bars: Half widths that hold 95 % of errors, by parameter.
     """

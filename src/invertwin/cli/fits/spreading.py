@@ -46,8 +46,8 @@ class FitWorkers:
         """Workers that the options `--engine` and `--workers` ask for; None without them.
 
         Args:
-            engine: Of the option.
-            count: Of the option; None where it is not given.
+            engine: Engine of the option.
+            count: Count of the option; None where it is not given.
         """
         return None if engine == "processes" and count is None else cls(engine, count or 1)
 
@@ -67,7 +67,7 @@ def distribute_fits(
         run: The run file.
         folder: Gets the files.
         console: Shows progress.
-        workers: Who fits.
+        workers: Processes that fit.
         fits: Way to fit and number of the start of each.
 
     Raises:
@@ -110,7 +110,7 @@ def run_fit_job(
     Args:
         fit_one: fits; a function of a module.
         run_toml: the run file.
-        files: what the fit goes on from, such as the calibration, by path in the folder.
+        files: inputs of the fit, such as the calibration, by path in the folder.
         job: way to fit, and number of the start.
     """
     run = validate_run(tomllib.loads(run_toml), Path("run.toml"))

@@ -171,7 +171,7 @@ def find_image_peak(
     Args:
         capture: recording of a radar.
         center: middle of the disc, at the height of the target [m].
-        radius: of the disc [m].
+        radius: radius of the disc [m].
 
     Returns:
         None without a coherent echo in the disc, or without a dense track.

@@ -38,9 +38,8 @@ class Uncertainty:
 
     They state the effect of speckle and noise on the estimate near its minimum, and of the error of
     sizes that the fit holds (``size_errors``). The verdict assesses wrong minima, models and
-    starts. A direction that is known to a quarter of its span at
-    best has the error bar of the loss profile two spans away, if the profile rises less than the
-    curvature at the minimum predicts.
+    starts. A direction that is known to a quarter of its span at best has the error bar of the loss
+    profile two spans away, if the profile rises less than the curvature at the minimum predicts.
 
     Attributes:
         names: names of the coordinates, such as "letter.x".

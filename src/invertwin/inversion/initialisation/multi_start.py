@@ -43,8 +43,8 @@ class Candidate:
 
     Attributes:
         scene: Initial scene.
-        observations: With sensors and unknowns that begin there.
-        group: Of candidates of one group the best one alone is fitted; None = of none.
+        observations: Observations with sensors and unknowns that begin there.
+        group: Only the best candidate of a group is fitted; None = no group.
     """
 
     scene: Scene

@@ -22,9 +22,9 @@ def soft_quantile(values: Float64[Tensor, " n"], share: float, width: float) -> 
     It solves mean σ((q − v)/width) = share; width 0 gives the quantile itself.
 
     Args:
-        values: At least one.
-        share: Between 0 and 1.
-        width: In the unit of the values.
+        values: Values, at least one.
+        share: Share between 0 and 1.
+        width: Width in the unit of the values.
     """
     if width <= 0:
         return torch.quantile(values, share)
@@ -47,12 +47,12 @@ class Coverage:
     them; the paths of the scene add up coherently among themselves.
 
     Attributes:
-        scene: What is in the way.
+        scene: Propagation environment.
         tx: The transmitter [m].
         receivers: [m].
         frequency: [Hz].
         direct: Path gain without a panel.
-        share: Of the receivers that count as the worst.
+        share: Share of the receivers that count as the worst.
     """
 
     scene: Scene
@@ -78,13 +78,13 @@ class Coverage:
         """With the paths that are there without a panel.
 
         Args:
-            scene: What is in the way.
+            scene: Propagation environment.
             tx: The transmitter [m].
             receivers: [rx, 3] [m].
             frequency: [Hz].
-            share: Of the receivers that count as the worst.
-            depth, edges: Of the paths, see ``trace_paths``.
-            seed: Of the rays that find them.
+            share: Share of the receivers that count as the worst.
+            depth, edges: Depth and edges of the paths, see ``trace_paths``.
+            seed: Seed of the rays that find them.
         """
         with torch.no_grad():
             paths = trace_paths(
@@ -133,7 +133,7 @@ class Coverage:
         """The level that the worst share of receivers is below [dB].
 
         Args:
-            gain: From ``gain``.
+            gain: Result of ``gain``.
             softness: See ``soft_quantile`` [dB].
         """
         return soft_quantile(10 * (gain + _FLOOR).log10(), self.share, softness)

@@ -36,16 +36,17 @@ class Metasurface:
     It is no object of the scene: it blocks nothing, and what lies behind it mirrors as without it.
 
     Attributes:
-        position: Of its centre [m].
+        position: Position of its centre [m].
         axes: Columns are its normal and its y and z axes, in the world.
-        phase: Of the elements along y and z [rad]; 0 = those of a mirror that turns the field over.
-        spacing: Of the elements, along y and z alike [m]; a cell is as large. Half a wavelength
+        phase: Phases of the elements along y and z [rad]; 0 = a mirror that inverts the field.
+        spacing: Distance of elements along y and z [m]; a cell is as large. Half a wavelength
             and less sum up to the integral over a plate.
-        amplitude: Of the elements, one or one for each; 1 = all that falls on a cell is scattered.
+        amplitude: Amplitude of all elements, or one for each; 1 = the cell scatters all power that
+            falls on it.
         bits: Phases are rounded to 2^bits values; derivatives pass straight through. None does not
             round.
-        pattern: Of an element, about its normal. None is that of an aperture, ½(cosθ_t + cosθ_r),
-            which ends at once behind the panel's plane.
+        pattern: Pattern of an element about its normal. None is that of an aperture, ½(cosθ_t +
+            cosθ_r), which ends at once behind the panel's plane.
 
     Raises:
         InputError: Wrong shapes, axes that are not orthonormal, or a number out of range.
@@ -134,7 +135,7 @@ def panel_response(
     Its phase is that over the phase of the path by the panel's centre, ``e^{−jk(R₁+R₂)}``.
 
     Args:
-        scene: What is in the way.
+        scene: Propagation environment.
         panel: The metasurface.
         tx, rx: Places of the antennas [m].
         frequency: [Hz].
@@ -218,11 +219,11 @@ def panel_paths(
     From the panel to the antennas waves go straight, unless something is in the way.
 
     Args:
-        scene: What is in the way.
+        scene: Propagation environment.
         panels: One or several; each sees the antennas, none sees another.
         tx: Transmitters, [3] or [tx, 3] in the world [m].
         rx: Receivers, [3] or [rx, 3] [m].
-        frequency: Of the coefficients [Hz].
+        frequency: Frequency of the coefficients [Hz].
         blur: Added to the width over which shadows end on a panel [m]; more than 0 smooths the
             landscape of a fit.
         boundary: False leaves out of derivatives that shadows move over panels, for ablation.

@@ -33,9 +33,9 @@ class WallPath:
     """A level path along walls, with the room on its left; corners are rounded.
 
     Args:
-        corners: Of the walls' plan, [corner, 2], off the walls by as much as a panel needs [m].
+        corners: Corners of the walls' plan, [corner, 2], as far off the walls as a panel needs [m].
         height: z of the path [m].
-        radius: Of round corners [m].
+        radius: Radius of round corners [m].
         closed: Whether the last corner leads back to the first.
 
     Attributes:
@@ -132,9 +132,9 @@ class PanelPlacement(nn.Module):
     the focus. Values that leave their ranges in a step end on the border.
 
     Args:
-        path: Along the walls.
+        path: Path along the walls.
         tx: The transmitter that is focused [m].
-        target: On what [m].
+        target: Point on which it is focused [m].
         frequency: [Hz].
         counts: Elements along y and z whose own phases are fitted; None = of none: those are
             the matter of ``ElementPhases``.

@@ -144,7 +144,7 @@ def interpolate_rates(power: Float[Tensor, "velocity range"]) -> Float64[Tensor,
     a bin away.
 
     Args:
-        power: of ``range_doppler``, averaged over channels.
+        power: result of ``range_doppler``, averaged over channels.
     """
     return interpolate_peak(power.roll(1, 0), power, power.roll(-1, 0)) / len(power)
 

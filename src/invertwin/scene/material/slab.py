@@ -2,9 +2,8 @@
 
 A plane wave in layer j has the normal wave number k s_j, s_j² = ε_j μ_j − sin²θ, and crosses it
 with the phase δ_j = k s_j d_j. With u_j = s_j/μ_j for perpendicular and s_j/ε_j for parallel
-polarisation,
-every interface has r = (u_i − u_j)/(u_i + u_j) and t = 2u_i/(u_i + u_j), and one more layer in
-front of a stack (r', t') makes
+polarisation, every interface has r = (u_i − u_j)/(u_i + u_j) and t = 2u_i/(u_i + u_j), and one more
+layer in front of a stack (r', t') makes
 
     r = (r_i + x)/(1 + r_i x),   t = t_i t' e^(−jδ)/(1 + r_i x),   x = r' e^(−2jδ).
 
