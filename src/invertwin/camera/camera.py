@@ -178,8 +178,8 @@ def object_numbers(names: Sequence[str], objects: Sequence[str]) -> Int64[Tensor
     """Numbers of the objects that a mask shows.
 
     Args:
-        names: All objects, in order.
-        objects: Those of the mask.
+        names: all objects, in order.
+        objects: those of the mask.
 
     Raises:
         InputError: None, or an unknown one.

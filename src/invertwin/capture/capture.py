@@ -194,7 +194,7 @@ class Capture:
 
     @classmethod
     def load(cls, path: str | Path, *, trusted: bool = False) -> "Capture":
-        """Read what `save` wrote.
+        """Read a capture that `save` wrote.
 
         A damaged file can hang or crash the libraries that read it. So a child process tries it
         first, within limits of time and memory; that takes about a second. Files of versions whose

@@ -1,4 +1,4 @@
-"""Linear prediction of samples from the samples before them: what breaks in a signal stands out.
+"""Linear prediction of samples from the samples before them: a break in a signal stands out.
 
 Sums of few tones, as beat signals are, follow from their past but for noise:
 ``x[n] = Σ a_k x[n − k]``. Source: Makhoul, Linear prediction: a tutorial review, 1975.
@@ -42,7 +42,7 @@ def prediction_coefficients(
 def prediction_residuals(
     products: Complex128[Tensor, "place lag lag"], coefficients: Complex128[Tensor, " lag"]
 ) -> Float64[Tensor, " place"]:
-    """Mean power of what prediction leaves at each place, forwards and backwards in time.
+    """Mean power of the prediction residual at each place, forwards and backwards in time.
 
     The same tones, read backwards, follow from the conjugate coefficients.
 

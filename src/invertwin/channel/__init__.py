@@ -1,4 +1,4 @@
-"""From a scene to propagation paths: the only room that knows the ray tracer."""
+"""From a scene to propagation paths: the only package that calls the ray tracer."""
 
 from invertwin.channel.beams.coherent_targets import as_absorbers as as_absorbers
 from invertwin.channel.beams.coherent_targets import combine_coherently as combine_coherently

@@ -161,7 +161,7 @@ def plan(options: command_options.ResumableOptions, file: command_options.FileAr
 def check(
     file: command_options.FileArgument, backend: command_options.BackendOption = None
 ) -> None:
-    """Say what a run file needs, memory and time, and do nothing else."""
+    """Say how much memory and time a run file needs, without running it."""
     from invertwin.cli.run_file import load_run
 
     run = load_run(file)
@@ -221,7 +221,7 @@ def look(options: command_options.LookOptions) -> None:
 
 @_command_with(command_options.TwinOptions, _DATA)
 def twin(options: command_options.TwinOptions) -> None:
-    """Find what stands in a recording, with no start: objects, positions, sizes, confidences."""
+    """Find the objects in a recording without an initial guess: positions, sizes, confidences."""
     _run_recording(options, "_twin")
 
 

@@ -1,4 +1,4 @@
-"""Data sets of simulated recordings: what is drawn, labels, shards, and their reader."""
+"""Data sets of simulated recordings: distributions, labels, shards, and their reader."""
 
 from invertwin.datasets.distributions import UNCHANGED as UNCHANGED
 from invertwin.datasets.distributions import Choice as Choice

@@ -1,4 +1,4 @@
-"""Fits among things that the scene lacks: clutter is imaged, and counts as background."""
+"""Fits in clutter: objects that the scene lacks are imaged, and count as background."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -21,7 +21,8 @@ from invertwin.models.radar import SurrogateMap
 from invertwin.models.whitened import WhitenedMap
 from invertwin.scene import Mesh, Scene, signed_distance
 
-# Of the power of fitted objects: more clutter may be parts of them, of a letter that stands turned.
+# Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
+# as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
@@ -37,7 +38,7 @@ def reconstruct_among_clutter(
     always: bool = True,
     **options: Any,
 ) -> inversion.Reconstruction:
-    """Fit objects among things that the scene lacks.
+    """Fit objects in clutter, the echoes of objects that the scene lacks.
 
     Echoes that the scene does not explain count as background, except around the objects that are
     fitted, see ``estimate_clutter``. A second fit, without blur, starts from the result of the
@@ -102,7 +103,7 @@ def reconstruct_among_clutter(
 def _find_rivals(
     scene: Scene, observations: Sequence[inversion.Observation], fitted: Sequence[str], seed: int
 ) -> tuple[str, ...]:
-    """Name clutter that is so bright that it may be parts of the fitted objects, elsewhere."""
+    """State where clutter is so bright that it may be echoes of the fitted objects."""
     found = []
     for observation in observations:
         clutter = estimate_clutter(scene, observation, fitted, seed=seed)
@@ -119,7 +120,7 @@ def _find_rivals(
 def _predict_power_of(
     fitted: Sequence[str], scene: Scene, observation: inversion.Observation, seed: int
 ) -> float:
-    """Predict the sum over all bins of what objects add to a map, > 0, in the recording's unit."""
+    """Predict the power that objects add to a map, over all bins, > 0, in the recording's unit."""
     model, radar = observation.model.scale_blur(0.0), observation.initial_sensor()
     rest = {name: item for name, item in scene.objects.items() if name not in fitted}
     with torch.no_grad():

@@ -75,11 +75,11 @@ class DetectedObject:
         """An object without a shape.
 
         Args:
-            name: Name of the object.
-            position: Position [m].
-            deviations: Standard deviations of its coordinates.
-            sure: Probability that it exists.
-            motion: Its velocity [m/s] and track.
+            name: name of the object.
+            position: position [m].
+            deviations: standard deviations of its coordinates.
+            sure: probability that it exists.
+            motion: its velocity [m/s] and track.
         """
         return cls(name, "point", {"point": 1.0}, position, None, deviations, sure, *motion)
 
@@ -129,7 +129,7 @@ class Twin:
 
     Attributes:
         objects: objects in order of existence probability; moving ones last.
-        level: Height of the ground [m].
+        level: height of the ground [m].
         image: image of the echoes and of unobserved regions.
         predicted: predicted maps of the objects with the background; None if only positions were
             found.

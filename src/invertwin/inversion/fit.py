@@ -90,13 +90,13 @@ class Fit:
     """One stage of a fit and its state.
 
     Attributes:
-        scene: The scene before any module is applied.
+        scene: the scene before any module is applied.
         observations: observations with prepared models.
-        unknowns: Modules of the scene, applied in order.
+        unknowns: modules of the scene, applied in order.
         sensor_unknowns: modules of the sensor of each observation.
         stage: schedule of the stage.
-        number: Number of the stage, from 0.
-        is_last: Whether it is the last stage.
+        number: number of the stage, from 0.
+        is_last: whether it is the last stage.
         progress: progress so far.
     """
 
@@ -146,12 +146,12 @@ class Fit:
                 f"expected at least {stage.held_out} frames in every observation with held_out = "
                 f"{stage.held_out}, got {few}; hold out none, or a larger share"
             )
-        rules = stage.optimizer or settings.optimizer
-        rough = [o.model for o in observations if not o.model.is_smooth]
-        if rough and rules.kind == "gauss_newton":
+        method = stage.optimizer or settings.optimizer
+        not_smooth = [o.model for o in observations if not o.model.is_smooth]
+        if not_smooth and method.kind == "gauss_newton":
             raise InputError(
                 "expected smooth models such as SurrogateMap with kind 'gauss_newton', got "
-                f"{type(rough[0]).__name__}; use 'adam'"
+                f"{type(not_smooth[0]).__name__}; use 'adam'"
             )
         # Before models draw random numbers, which follow from the rest.
         self.fingerprint = Fingerprint(
@@ -165,7 +165,7 @@ class Fit:
             o.model.prepare(scene, o.sensor, derive_seed(settings.seed, k))
             for k, o in enumerate(observations)
         ]
-        self.rules, self.optimizer = rules, rules.build(self.modules, self.objective, rates)
+        self._method, self.optimizer = method, method.build(self.modules, self.objective, rates)
         self.progress = FitProgress(self.parameters())
 
     def run(self, callbacks: Sequence[Callback]) -> Status:
@@ -361,7 +361,7 @@ class Fit:
     def _run_steps(self, callbacks: Sequence[Callback]) -> Status:
         stage = self.stage
         while (step := self.progress.step) < stage.steps:
-            self.rules.set_rates(self.optimizer, step / stage.steps)
+            self._method.set_rates(self.optimizer, step / stage.steps)
             before = self.parameters()
             try:
                 number = self._take_step(step)

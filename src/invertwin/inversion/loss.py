@@ -395,9 +395,9 @@ def resolve_loss(
     are, of one resolution, for models with ``holds_fields``.
 
     Args:
-        model: Forward model whose maps are compared.
-        loss: The given loss; None = the default.
-        observed: Observed map, which a likelihood expects to be power.
+        model: forward model whose maps are compared.
+        loss: the given loss; None = the default.
+        observed: observed map, which a likelihood expects to be power.
 
     Raises:
         InputError: A likelihood of maps that do not hold power.
@@ -464,8 +464,8 @@ class CorrelationLoss:
         """The Gauss–Newton matrix: the loss is half the squared distance of two unit vectors.
 
         Args:
-            simulated, measured: The maps.
-            tangents: Derivatives of the simulated map with respect to p parameters.
+            simulated, measured: the maps.
+            tangents: derivatives of the simulated map with respect to p parameters.
         """
         power = simulated.detach()
         rows = [torch.func.jvp(self._unit_row, (power,), (t.to(power),))[1] for t in tangents]

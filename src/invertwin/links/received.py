@@ -182,7 +182,7 @@ class PropagationSettings:
     def panel_and_rough_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
-        """Sums of ``moments`` of what ``trace_coverage`` does not trace: panels, rough surfaces.
+        """Sums of ``moments`` of paths that ``trace_coverage`` lacks: panels, rough surfaces.
 
         Args:
             scene: Propagation environment.

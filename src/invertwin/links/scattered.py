@@ -136,7 +136,7 @@ def _incoherent_scene(scene: Scene, frequency: float) -> Scene | None:
 
 
 def _length_grid(scene: Scene, ends: Sequence[Tensor], depth: int) -> channel.Grid:
-    """Bins that hold every path of so many bounces, with room for what sheets add."""
+    """Bins that hold every path of so many bounces, with room for the extra lengths of sheets."""
     points = torch.cat([item.vertices.detach() for item in scene.objects.values()] + [*ends])
     step = (0.6 * (depth + 1) * float((points.amax(0) - points.amin(0)).norm()) + 1.0) / (_BINS - 3)
     return channel.Grid(range_start=-step, range_step=step, range_count=_BINS)

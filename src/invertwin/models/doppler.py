@@ -30,7 +30,7 @@ _Maps = Float[Tensor, "frame velocity range u v"]  # power of every frame
 
 @dataclass(frozen=True, eq=False)
 class RangeDopplerMap(ForwardModel):
-    """Power over range rate, range and direction of what moves.
+    """Power over range rate, range and direction of moving targets.
 
     What stands still is taken out of a recording as the mean over the chirps; so a prediction
     holds the objects with a velocity alone. Other objects hide them. A silhouette has no boundary
@@ -88,7 +88,7 @@ class RangeDopplerMap(ForwardModel):
             )
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> _Maps:
-        """The expected power of what moves. See ``ForwardModel.predict``.
+        """The expected power of moving targets. See ``ForwardModel.predict``.
 
         Raises:
             InputError: No object has a velocity.
@@ -117,7 +117,7 @@ class RangeDopplerMap(ForwardModel):
         return range_doppler_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
 
     def observe(self, recording: ChirpCapture) -> _Maps:
-        """The measured power of what moves.
+        """The measured power of moving targets.
 
         Raises:
             InputError: A recording of another number of chirps.

@@ -17,7 +17,7 @@ _NOISE_ALONE = 1e9  # of the background: no echo is seen beside it
 
 @dataclass(frozen=True, eq=False)
 class WhitenedMap(ForwardModel):
-    """Maps of another model over a background: the mean power of what that model lacks.
+    """Maps of another model over a background: the mean power of objects that it lacks.
 
     Observed and predicted maps are divided by the background B of each bin, relative to its mean.
     The likelihood of power b then is that of the mean g a + n B, with one level n for all bins.

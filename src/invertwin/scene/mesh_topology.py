@@ -3,6 +3,9 @@
 Files from CAD programs, STL files and merged parts repeat a corner for each face, equal to rounding
 only, and put the corners of one part on an edge of another. An edge is the boundary of a surface
 only where no other triangle continues it.
+
+``points`` are positions in metres. ``places`` are normalised: each group of vertices is scaled to a
+diagonal of 1, and groups stand side by side (``separate_groups``).
 """
 
 from __future__ import annotations

@@ -490,8 +490,8 @@ def position_coordinates(name: str, parameter: str, mask: Tensor) -> list[Coordi
     """The free coordinates of a position [m].
 
     Args:
-        name: Name of the object or antenna at the position.
-        parameter: Name of the parameter [3] that moves it.
+        name: name of the object or antenna at the position.
+        parameter: name of the parameter [3] that moves it.
         mask: 1 for each free axis.
     """
     return [

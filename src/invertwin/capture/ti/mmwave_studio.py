@@ -155,7 +155,7 @@ def _list_items(written: Any, key: str) -> list[dict[str, Any]]:
 
     Args:
         written: A list, an item, or an object of items.
-        key: Key that every item has.
+        key: key that every item has.
     """
     if isinstance(written, dict):
         written = [written] if key in written else list(written.values())

@@ -182,7 +182,7 @@ def _boundary_paths(
 
 
 def _read_random_walk(trace: PowerTracer, records: PathRecords) -> Iterator[Paths]:
-    """The paths of one point, of two and so on; the kernel says what arrives at the last point."""
+    """The paths of one point, of two and so on, with the kernel's throughput at the last point."""
     vertices = [records.read_vertex(mi.UInt32(number)) for number in range(records.depth)]
     names = ("face", "b1", "b2", "throughput", "is_visible")
     columns = [[to_torch(getattr(vertex, name)) for vertex in vertices] for name in names]

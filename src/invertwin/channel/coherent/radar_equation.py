@@ -212,7 +212,7 @@ def _outer_cosine(geometry: Geometry, row: Tensor, cosine: Tensor) -> tuple[Tens
 def _segment_medium(
     geometry: Geometry, start: MaterialPoints, end: MaterialPoints, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Refractive index and attenuation of what lies between two points."""
+    """Refractive index and attenuation of the medium between two points."""
     index, attenuation = torch.ones_like(direction[:, 0]), torch.zeros_like(direction[:, 0])
     surfaces = geometry.surfaces
     for point, sign in ((start, 1.0), (end, -1.0)) if geometry.has_refracting_bodies else ():

@@ -147,8 +147,8 @@ class _Strip:
         index: strip number.
         is_inside: mask of strips whose row is on the grid and whose centre is at most one bin off.
         transverse_weight: weight of the row.
-        transverse_derivatives: its derivatives in range, u and v; along the strip axis the weight
-            itself.
+        transverse_derivatives: derivatives of the row's weight in range, u and v; the entry of the
+            strip axis is the weight itself.
         weights: weights of the three bins.
         weight_derivatives: their derivatives along the strip axis.
     """

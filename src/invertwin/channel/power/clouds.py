@@ -162,20 +162,21 @@ class _CloudRays:
         back = points - self.origins[1][self.frame][:, None]
         return_length = back.norm(dim=2)
         rotation = link.rotations[self.frame]
-        ways = direction[:, None], back / return_length[..., None]
-        towards = [torch.einsum("rij,rkj->rki", rotation.mT @ self.rotation, way) for way in ways]
-        gain = link.tx_pattern.gain(towards[0]) * link.rx_pattern.gain(towards[1])
+        directions = direction[:, None], back / return_length[..., None]
+        to_radar = rotation.mT @ self.rotation
+        local = [torch.einsum("rij,rkj->rki", to_radar, way) for way in directions]
+        gain = link.tx_pattern.gain(local[0]) * link.rx_pattern.gain(local[1])
         scale = (link.wavelength / (4 * math.pi)) ** 2 * self.cloud.albedo / (4 * math.pi)
         (share,) = polarisation_shares(link, depolarising=False)
         scale = scale * share.for_bounces(1)
         power = scale * weight[:, None] * gain * scattered / return_length.square()
-        columns = [power, 0.5 * (distance + return_length), towards[1][..., 1], towards[1][..., 2]]
+        columns = [power, 0.5 * (distance + return_length), local[1][..., 1], local[1][..., 2]]
         return frame.reshape(-1), *(column.reshape(-1) for column in columns)  # type: ignore[return-value]
 
     def _clip_to_box(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the distances at which rays that meet the box enter and leave it."""
-        slope = torch.where(direction.abs() < _MIN_COMPONENT, _MIN_COMPONENT, direction)
-        first, second = (self.cloud.low - origin) / slope, (self.cloud.high - origin) / slope
+        ray = torch.where(direction.abs() < _MIN_COMPONENT, _MIN_COMPONENT, direction)
+        first, second = (self.cloud.low - origin) / ray, (self.cloud.high - origin) / ray
         near = torch.minimum(first, second).amax(1).clamp_min(0.0)
         return near, torch.maximum(first, second).amin(1)
 

@@ -179,13 +179,13 @@ def _deposit_surfaces(
             lossy = replace(geometry, surfaces=surfaces)
         with _DisableFuncTorch():
             bare = power_trace.strip_scene_derivatives(lossy, link)
-            trace = power_trace.PowerTracer(
+            tracer = power_trace.PowerTracer(
                 *bare, sampling, seed, scheme=scheme, reference=reference,
                 coupling=(share.odd, share.even), differentiate_antennas=antennas_move,
             )  # fmt: skip
         tables = power_trace.differentiable_tables(lossy, link)
         layout = bins.BinLayout.from_link(grid, link)
-        maps.append(_Deposit.apply(trace, layout, any(map(is_differentiated, tables)), *tables))
+        maps.append(_Deposit.apply(tracer, layout, any(map(is_differentiated, tables)), *tables))
     return maps
 
 
@@ -209,18 +209,18 @@ class _Deposit(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        trace: power_trace.PowerTracer, layout: bins.BinLayout, derivative: bool, *tables: Tensor
+        tracer: power_trace.PowerTracer, layout: bins.BinLayout, derivative: bool, *tables: Tensor
     ) -> Tensor:
         out = bins.BinAccumulator(layout)
-        trace.last_records = trace.deposit(out, record=derivative)
+        tracer.last_records = tracer.deposit(out, record=derivative)
         if derivative:
-            _ = trace.boundary_samples  # prepared while the paths are traced
+            _ = tracer.boundary_samples  # prepared while the paths are traced
         return out.to_map()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # type: ignore[override]
-        ctx.trace, ctx.layout, _, *tables = inputs
-        ctx.likes, ctx.backend = [strip_derivatives(table) for table in tables], backend()
+        ctx.tracer, ctx.layout, _, *tables = inputs
+        ctx.table_templates, ctx.backend = [strip_derivatives(table) for table in tables], backend()
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
@@ -275,18 +275,18 @@ class _Linear(torch.autograd.Function):
 
 def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Tensor, ...]:
     """Pull the gradient of the map back to some tables (vector–Jacobian product)."""
-    trace: power_trace.PowerTracer = ctx.trace
+    tracer: power_trace.PowerTracer = ctx.tracer
     with tracing(ctx.backend), torch_threads(1):
-        tables = _attach_tables(trace, names)
-        inputs = trace.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
+        tables = _attach_tables(tracer, names)
+        inputs = tracer.inputs(tables, joint_antennas=("tx" in tables) == ("rx" in tables))
         strip_gradient = ctx.layout.expand_to_strips(grad)
 
         def gather(*path: Any) -> bins.FourFloats:
             return bins.gather_adjoint(strip_gradient, ctx.layout, *path)
 
-        boundary = trace.trace_boundary(inputs)
-        for records in [trace.last_records] if trace.last_records else trace.iterate_records():
-            replay.pull(trace.rays, inputs, records, gather)
+        boundary = tracer.trace_boundary(inputs)
+        for records in [tracer.last_records] if tracer.last_records else tracer.iterate_records():
+            replay.pull(tracer.rays, inputs, records, gather)
             dr.eval([dr.grad(table) for table in tables.values()])
             del records  # before the next ones are allocated
         for paths in boundary:
@@ -294,27 +294,27 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
             if dr.grad_enabled(paths.speed):
                 dr.backward_from(paths.speed * total)
             dr.eval([dr.grad(table) for table in tables.values()])
-        likes = dict(zip(DIFFERENTIABLE, ctx.likes, strict=True))
-        return tuple(from_table(name, dr.grad(tables[name]), likes[name]) for name in names)
+        templates = dict(zip(DIFFERENTIABLE, ctx.table_templates, strict=True))
+        return tuple(from_table(name, dr.grad(tables[name]), templates[name]) for name in names)
 
 
 def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tensor:
     """Push tangents of some tables forward to the map (Jacobian–vector product)."""
-    trace: power_trace.PowerTracer = ctx.trace
+    tracer: power_trace.PowerTracer = ctx.tracer
     with tracing(ctx.backend), torch_threads(1):
         given = dict(zip(names, tangents, strict=True))
-        tables = _attach_tables(trace, names)
-        inputs = trace.inputs(tables, joint_antennas=_are_equal(given.get("tx"), given.get("rx")))
+        tables = _attach_tables(tracer, names)
+        inputs = tracer.inputs(tables, joint_antennas=_are_equal(given.get("tx"), given.get("rx")))
         out = bins.BinAccumulator(ctx.layout)
 
         def set_tangents() -> None:
             for name, table in tables.items():
                 dr.set_grad(table, to_table(name, given[name]))
 
-        boundary = trace.trace_boundary(inputs)
-        for records in [trace.last_records] if trace.last_records else trace.iterate_records():
+        boundary = tracer.trace_boundary(inputs)
+        for records in [tracer.last_records] if tracer.last_records else tracer.iterate_records():
             set_tangents()
-            replay.push(trace.rays, inputs, records, out.add_tangent)
+            replay.push(tracer.rays, inputs, records, out.add_tangent)
             dr.eval(out.values)
             del records
         for paths in boundary:
@@ -324,9 +324,9 @@ def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tenso
         return out.to_map()
 
 
-def _attach_tables(trace: power_trace.PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
+def _attach_tables(tracer: power_trace.PowerTracer, names: Iterable[str]) -> dict[str, mit.Float]:
     """Copy some of the kernel's tables and enable their derivatives."""
-    tables = {name: mi.Float(trace.fixed.table(name)) for name in names}
+    tables = {name: mi.Float(tracer.fixed.table(name)) for name in names}
     dr.enable_grad(list(tables.values()))
     return tables
 

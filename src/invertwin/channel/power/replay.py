@@ -228,7 +228,7 @@ def _evaluate_vertex(
 
 
 def _log_derivative_factor(active: mit.Bool, total: mit.Float, value: mit.Float) -> mit.Float:
-    """total · dlog(value): the factor of the attached value; zero if inactive."""
+    """Factor of an attached value whose derivative is ``total · d log(value)``; 0 if inactive."""
     return dr.select(active, total / dr.detach(value), 0.0)
 
 

@@ -46,8 +46,8 @@ Record = TypeVar("Record")
 class SilhouetteSample:
     """Points on edges and the triangles on which their shadows fall (Dr.Jit arrays).
 
-    The covered side of the shadow boundary is that of the edge's triangle that leaves the plane
-    through edge and ray most.
+    The plane through edge and ray divides the edge's triangles. Its covered side is that on which
+    a triangle has its vertex farthest from the plane.
 
     Attributes:
         index: sample numbers.

@@ -23,7 +23,7 @@ from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.surface_point import SurfacePoint, interpolate_position
 from invertwin.errors import InputError
 
-Reference = tuple[Geometry, Link]  # that define the densities instead of the scene
+Reference = tuple[Geometry, Link]  # define the sampling densities instead of the scene
 
 
 @dataclass(frozen=True)

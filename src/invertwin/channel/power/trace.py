@@ -58,7 +58,7 @@ def strip_scene_derivatives(geometry: Geometry, link: Link) -> tuple[Geometry, L
 
 
 class PowerTracer:
-    """Detached part of a call: the paths. Every call yields the same ones.
+    """Paths of one map, detached; all its methods trace the same ones.
 
     Args:
         geometry: scene as flat tables.
@@ -84,7 +84,7 @@ class PowerTracer:
         differentiate_antennas: bool = True,
     ) -> None:
         self.sampling, self.seed = sampling, seed
-        self.last_records: PathRecords | None = None  # the last paths, if they fit
+        self.last_records: PathRecords | None = None  # those of the last map, if they fit
         self.rays = RayScene(geometry, link, differentiate_antennas=differentiate_antennas)
         sampler = RaySampler if scheme == "rays" else AreaSampler
         self.sampler = sampler(self.rays, sampling.samples * self.rays.scene_count, seed, reference)

@@ -1,4 +1,4 @@
-"""A scene as flat tables: what all paths are computed from, still torch and differentiable."""
+"""A scene as flat tables of torch tensors with derivatives, from which all paths are computed."""
 
 import math
 import warnings

@@ -35,10 +35,10 @@ class Topology:
     The acceleration structure is rebuilt only when the vertices differ from the last upload.
 
     Args:
-        faces: Vertex indices of all triangles; those of closed objects are turned outwards.
-        vertex_object: Object of every vertex, in ascending order.
-        vertices: Positions in the objects' own frames, or in the world where objects share edges.
-        groups: Group of each object, within which vertices at one place count as one.
+        faces: vertex indices of all triangles; those of closed objects are turned outwards.
+        vertex_object: object of every vertex, in ascending order.
+        vertices: positions in the objects' own frames, or in the world where objects share edges.
+        groups: group of each object, within which vertices at one place count as one.
     """
 
     def __init__(
@@ -266,13 +266,15 @@ def edge_tables(
 
     An edge ends where vertices of others lie on it, so that T-junctions make no false open edges;
     doubled faces count once.
-    The other two tables have as many columns as the edge with most triangles, at least 2; absent
-    ones are −1.
 
     Args:
         edges: edges of triangles, as ``close_cracks`` returns them.
         places: positions in units of the size of their group, likewise.
         owner: object of each triangle.
+
+    Returns:
+        Vertices at the ends, opposite vertices, and triangles of each edge. The last two have as
+        many columns as the edge with most triangles, at least 2; absent ones are −1.
     """
     ends, counts, apex, triangle = mesh_topology.merge_doubled_sides(edges, places, owner)
     opposite = np.full((len(ends), counts.max(initial=2)), -1, dtype=np.int64)

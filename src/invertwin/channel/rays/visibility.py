@@ -30,7 +30,7 @@ _Numbers = Int64[Tensor, " n"]
 
 @dataclass(frozen=True)
 class DiscontinuityCurves:
-    """Straight pieces of the curves at which what is seen may jump; detached.
+    """Straight pieces of the curves at which visibility may jump; detached.
 
     Attributes:
         start, end: Start and end of the pieces [m].

@@ -256,9 +256,10 @@ def _run_check(
             )
     check = settings.build()
     radar = seen.device[0] if seen.device else None
-    how: Any = {"settings": check, "seed": run.seed, "progress": say}
-    ends: Any = {"scene": scene, "sensor": seen.sensor, "acts_on": settings.acts_on}
-    report = gradcheck(seen.model, module, tangent, **ends, **how)
+    report = gradcheck(
+        seen.model, module, tangent, scene=scene, sensor=seen.sensor, acts_on=settings.acts_on,
+        settings=check, seed=run.seed, progress=say,
+    )  # fmt: skip
     save_picture(folder, f"{name}", seen.draw(report))
     moved = filter(None, [getattr(settings.parameter, "object", None)])
     save_picture(folder, f"{name}_scene", plotting.scene(scene, radar, highlight=[*moved]))

@@ -223,7 +223,7 @@ class DataKind(ABC):
         return replace(problem, run=run, sensor_data=data)
 
     def prepare(self, problem: Problem, folder: RunFolder, console: Console) -> Problem:
-        """The problem after what comes before all fits: calibration, an initial estimate."""
+        """The problem after the steps before all fits: calibration, an initial estimate."""
         return problem
 
     def with_recording_of_start(self, problem: Problem, number: int, console: Console) -> Problem:
@@ -296,7 +296,7 @@ class DataKind(ABC):
 
 
 def make_observations(problem: Problem, start: Start | None = None) -> list[Observation]:
-    """Observations of a fit: data, model, and what is unknown of the sensor.
+    """Observations of a fit: data, model, and unknowns of the sensor.
 
     Args:
         problem: Problem of a mode.
@@ -430,7 +430,7 @@ def method_run(run: RunFile, method: str) -> RunFile:
 
 
 def fitted_tables(run: RunFile) -> dict[str, Any]:
-    """The tables of what is fitted, by name."""
+    """The tables of the fitted parameters, by name."""
     tables = build.tables_by_name(run.parameters)
     names = set(run.fit_settings.parameters or tables)
     if run.stages and all(stage.parameters for stage in run.stages):

@@ -153,7 +153,7 @@ def parameter_values(fits: Fits) -> dict[str, list[Any]]:
 
 
 def state_positions(fits: Fits, confidence: Row) -> str:
-    """State positions and angles of what was fitted, with error bars where these hold.
+    """State positions and angles of the fitted parameters, with error bars where these hold.
 
     Args:
         fits: all fits of a run.
@@ -270,9 +270,9 @@ def describe_outcome(run: RunFile, metrics: dict[str, Any], *, counted: bool = F
     """Say in a sentence or two what came out.
 
     Args:
-        run: The run file.
-        metrics: Numbers of the run.
-        counted: Count the successes of a single start, too.
+        run: the run file.
+        metrics: numbers of the run.
+        counted: count the successes of a single start, too.
     """
     count = metrics.get("starts_count", 1)
     which = f"Found: {metrics['answer']}. " if metrics.get("answer") else ""

@@ -70,15 +70,15 @@ class GradientReport:
     """Result of :func:`gradcheck`.
 
     Attributes:
-        full: Agreement with boundary paths.
-        interior: Agreement without boundary paths; equal to ``full`` if the model has none.
+        full: agreement with boundary paths.
+        interior: agreement without boundary paths; equal to ``full`` if the model has none.
         no_interior_edges: agreement with boundary paths, except those of shadows that surfaces cast
             on each other; None for paths of one bounce, which have none.
         no_contact: agreement with boundary paths, except those of the curves in which surfaces
             intersect or touch; None without such curves.
         difference_noise: ‖standard error‖₁ / ‖g_FD‖₁; 0 if maps do not depend on the seed.
         step_agreement: ‖FD(ε) − FD(ε/2)‖₁ / ‖FD(ε)‖₁ (includes the noise of both).
-        pairs: Number of independent difference pairs.
+        pairs: number of independent difference pairs.
         value, gradient, interior_gradient, difference: the map and its derivatives.
     """
 

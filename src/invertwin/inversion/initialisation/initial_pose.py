@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Gt, Lt
 from jaxtyping import Float64
@@ -123,10 +123,11 @@ class InitialPoseEstimator:
                 points, radar, resolution=radar.waveform.range_resolution
             )
         if self.scale:
-            scene = Scale(name, detections.estimate_scale(item, rectangle)).requires_grad_(False)(
-                scene
-            )
+            scale = Scale(name, detections.estimate_scale(item, rectangle))
+            scene = scale.requires_grad_(False)(scene)
         poses = detections.candidate_poses(scene[name], rectangle, radar)
-        how: dict[str, Any] = {"loss": loss, "surrogate": _POSE_SURROGATE, "seed": seed}
-        scene, losses = detections.select_pose(scene, name, poses, radar, capture, grid, **how)
+        scene, losses = detections.select_pose(
+            scene, name, poses, radar, capture, grid,
+            loss=loss, surrogate=_POSE_SURROGATE, seed=seed,
+        )  # fmt: skip
         return InitialEstimate(scene, len(points), losses, rectangle.size)

@@ -42,9 +42,9 @@ class Candidate:
     """A start among those that a search compares.
 
     Attributes:
-        scene: Initial scene.
-        observations: Observations with sensors and unknowns that begin there.
-        group: Only the best candidate of a group is fitted; None = no group.
+        scene: initial scene.
+        observations: observations with sensors and unknowns that begin there.
+        group: only the best candidate of a group is fitted; None = no group.
     """
 
     scene: Scene
@@ -72,8 +72,8 @@ class Screening:
         """The starts as candidates.
 
         Args:
-            scene: Scene as known.
-            observations: Recordings with their models, where starts are poses.
+            scene: scene as known.
+            observations: recordings with their models, where starts are poses.
 
         Raises:
             InputError: There are none.

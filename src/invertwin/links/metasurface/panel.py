@@ -1,4 +1,4 @@
-"""Metasurfaces: panels of many small elements, each of which turns the phase of what it scatters.
+"""Metasurfaces: panels of many small elements, each of which shifts the phase of its echo.
 
 The field from antenna to antenna over a panel is the sum over its elements,
 ``(λ/4π)(−j) Σ (d²/λ) ½(cosθ_t + cosθ_r)/(r₁r₂) V_t V_r A e^{−jk(r₁+r₂) + jφ}``, near the panel as

@@ -77,8 +77,8 @@ def march_cubes(
     """Corners, in steps between the nodes, and triangles where values on nodes are at a level.
 
     Args:
-        values: Values on the nodes.
-        level: Level of the surface.
+        values: values on the nodes.
+        level: level of the surface.
         gradient: "ascent" towards the inside, or "descent".
     """
     corners, faces, _, _ = marching_cubes(
