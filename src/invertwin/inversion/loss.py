@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
 
+_Bins: TypeAlias = Float[Tensor, "*map"]
 _MIN_POSITIVE = 1e-38  # lower limit of divisors, and noise as good as none
 _GAIN_STEPS = 30  # maximum number of iterations at a resolution; three or four suffice
 _GAIN_CHANGES = -0.8, 2.0  # limits of a relative step
@@ -441,9 +442,7 @@ class CorrelationLoss:
     def __post_init__(self) -> None:
         check_fields(self)
 
-    def __call__(
-        self, simulated: Float[Tensor, "*map"], measured: Float[Tensor, "*map"]
-    ) -> Float64[Tensor, ""]:
+    def __call__(self, simulated: _Bins, measured: _Bins) -> Float64[Tensor, ""]:
         """Return the loss: 0 for proportional maps, 1 for uncorrelated ones.
 
         Args:
@@ -456,10 +455,7 @@ class CorrelationLoss:
         return 1 - self._unit_row(simulated) @ self._unit_row(measured)
 
     def curvature(
-        self,
-        simulated: Float[Tensor, "*map"],
-        measured: Float[Tensor, "*map"],
-        tangents: Float[Tensor, "p *map"],
+        self, simulated: _Bins, measured: _Bins, tangents: Float[Tensor, "p *map"]
     ) -> Float64[Tensor, "p p"]:
         """The Gauss–Newton matrix: the loss is half the squared distance of two unit vectors.
 

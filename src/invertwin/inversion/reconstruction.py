@@ -65,7 +65,7 @@ class Reconstruction:
         Raises:
             InputError: See :class:`invertwin.inversion.confidence.uncertainty.CovarianceEstimator`.
         """
-        return CovarianceEstimator(self.result, size_errors=True).error_bars()
+        return CovarianceEstimator(self.result, is_fitted=True).error_bars()
 
     @cached_property
     def verdict(self) -> verdicts.Verdict:

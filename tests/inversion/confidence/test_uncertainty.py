@@ -25,7 +25,12 @@ from scenes import float64
 
 
 def fitted(
-    model: Blob, seed: int = 0, axes: str = "y", loss: Any = LAW, seen: Blob | None = None
+    model: Blob,
+    seed: int = 0,
+    axes: str = "y",
+    loss: Any = LAW,
+    seen: Blob | None = None,
+    rate: float = 0.1,
 ) -> Reconstruction:
     """A fit of one look at a ball at y = 0.1, as another model sees it."""
     look = replace(seen or model, known=True).realisations(scene(0.1), None, 0)
@@ -35,7 +40,7 @@ def fitted(
         Observation(model, look(seed, 0.0), sensor=None),
         Translation("ball", axes=axes),
         loss=loss,
-        optimizer=Optimizer("gauss_newton", rate=0.1),
+        optimizer=Optimizer("gauss_newton", rate=rate),
         schedule=Schedule(8),
     )
 
@@ -64,6 +69,21 @@ def test_stated_errors_hold():
     assert sum(inside) >= 53
     spread = float(torch.tensor(errors).std())
     assert fits[0].uncertainty.deviations["ball.y"] == pytest.approx(spread, rel=0.3)
+
+
+def test_a_fit_that_stops_early_says_how_far_from_its_minimum():
+    early, done = fitted(Blob(), rate=1e-4), fitted(Blob())
+    ways = [float(done.scene["ball"].center[1] - early.scene["ball"].center[1]), 0.0]
+    alone = CovarianceEstimator(early.result).error_bars().deviations["ball.y"]
+    assert ways[0] > 3 * alone
+    for fit, way in zip((early, done), ways, strict=True):
+        (step,) = fit.uncertainty.newton_step
+        assert fit.uncertainty.deviations["ball.y"] > step
+        assert step == pytest.approx(way, rel=0.3, abs=0.1 * alone)
+    assert done.uncertainty.unfinished == ()
+    (sentence,) = early.uncertainty.unfinished
+    assert sentence.startswith("ball.y: the fit stopped 0.0")
+    assert "before its minimum; give it more steps" in sentence
 
 
 def half_size() -> float:

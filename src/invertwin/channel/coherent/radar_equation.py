@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -22,6 +22,8 @@ from invertwin.channel.rays.ray_scene import RayScene, find_passed_sheets
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
 from invertwin.channel.rows import Rows
 from invertwin.constants import SPEED_OF_LIGHT
+
+_Numbers: TypeAlias = Int64[Tensor, " n"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class MaterialPoints(Rows):
     position: Float64[Tensor, "n 3"]
     normal: Float64[Tensor, "n 3"]
     jacobian: Float64[Tensor, " n"]
-    row: Int64[Tensor, " n"]
+    row: _Numbers
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class PathTransfer:
         depolarisation: Share of the power that changes its polarisation, at every point.
     """
 
-    frame: Int64[Tensor, " n"]
+    frame: _Numbers
     points: Sequence[MaterialPoints]
     power: Float64[Tensor, " n"]
     incident_power: Float64[Tensor, " n"]
@@ -108,7 +110,7 @@ class PathTransfer:
 
 
 def radar_equation(
-    geometry: Geometry, link: Link, frame: Int64[Tensor, " n"], points: Sequence[MaterialPoints]
+    geometry: Geometry, link: Link, frame: _Numbers, points: Sequence[MaterialPoints]
 ) -> PathTransfer:
     """Evaluate the radar equation of paths from antenna to antenna; nothing is in their way.
 
@@ -224,7 +226,7 @@ def _segment_medium(
 
 
 def _interpolate_table(
-    table: Float64[Tensor, "row cos"], row: Int64[Tensor, " n"], cosine: Float64[Tensor, " n"]
+    table: Float64[Tensor, "row cos"], row: _Numbers, cosine: Float64[Tensor, " n"]
 ) -> Float64[Tensor, " n"]:
     """A table over |cosθ|, linear between its entries."""
     entries = table.shape[1]
@@ -258,9 +260,7 @@ def trace_transmittance(
     return transmittance, extra
 
 
-def find_unblocked(
-    rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths
-) -> Bool[Tensor, " n"]:
+def find_unblocked(rays: RayScene, frame: _Numbers, paths: SurfacePaths) -> Bool[Tensor, " n"]:
     """Find the paths that nothing but sheets intersects.
 
     Args:
@@ -273,7 +273,7 @@ def find_unblocked(
         return torch.stack([transmittance > 0 for transmittance, _ in passes]).all(0)
 
 
-def evaluate_paths(rays: RayScene, frame: Int64[Tensor, " n"], paths: SurfacePaths) -> PathTransfer:
+def evaluate_paths(rays: RayScene, frame: _Numbers, paths: SurfacePaths) -> PathTransfer:
     """Evaluate the radar equation along unblocked paths, past the sheets in their way.
 
     Args:

@@ -8,7 +8,7 @@ polarisation by 1 − 4χ: scattering that is isotropic about the line of sight,
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Complex128, Float64
@@ -17,6 +17,8 @@ from torch import Tensor
 from invertwin.channel.paths import Link
 
 _LINEAR, _CIRCULAR = 2.0, 4.0
+
+_Values: TypeAlias = Float64[Tensor, " row"]
 _MATRICES = torch.tensor(
     [[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1], [-1, 0]]],
     dtype=torch.complex128,
@@ -66,9 +68,7 @@ def polarisation_shares(link: Link, *, depolarising: bool) -> list[PolarisationS
     return [PolarisationShare(sum(p.odd for p in terms), sum(p.even for p in terms), 0.0)]
 
 
-def received_power_fraction(
-    link: Link, depolarisation: Sequence[Float64[Tensor, " row"]]
-) -> Float64[Tensor, " row"]:
+def received_power_fraction(link: Link, depolarisation: Sequence[_Values]) -> _Values:
     """Fraction of the power of paths that antennas receive.
 
     Args:
@@ -86,7 +86,7 @@ def received_power_fraction(
 
 
 def random_scattering_matrix(
-    depolarisation: Sequence[Float64[Tensor, " row"]], phase: Float64[Tensor, " row"]
+    depolarisation: Sequence[_Values], phase: _Values
 ) -> Complex128[Tensor, "#row 2 2"]:
     """Scattering matrices of random scatterers in V and H, receive × transmit, of unit amplitude.
 

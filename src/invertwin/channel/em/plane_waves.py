@@ -17,6 +17,8 @@ from torch.nn.functional import normalize
 
 from invertwin.scene.material.fresnel import LEAST_COSINE
 
+_Values: TypeAlias = Float64[Tensor, " row"]
+_Triangles: TypeAlias = Float64[Tensor, "*#row 3 3"]
 _Axes = Float64[Tensor, "row 2 3"]
 Waves: TypeAlias = Complex128[Tensor, "row 2 3"]
 Vectors = Float64[Tensor, "*row 3"]  # of any leading shape
@@ -35,9 +37,9 @@ class SmoothInterfaces(NamedTuple):
 
     conducting: Tensor
     permittivity: Complex128[Tensor, " row"]
-    thickness: Float64[Tensor, " row"]
-    coherence: Float64[Tensor, " row"]
-    rms_height: Float64[Tensor, " row"]
+    thickness: _Values
+    coherence: _Values
+    rms_height: _Values
 
     def rows(self, index: Tensor) -> "SmoothInterfaces":
         """Select rows."""
@@ -215,8 +217,8 @@ def radiate_currents(
 
 
 def roughness_attenuation(
-    interfaces: SmoothInterfaces, wave_number: float, cosine_sum: Float64[Tensor, " row"]
-) -> Float64[Tensor, " row"]:
+    interfaces: SmoothInterfaces, wave_number: float, cosine_sum: _Values
+) -> _Values:
     """Rayleigh roughness factor of the coherent field, exp(−½(kσ(cosθ + cosθ'))²).
 
     Args:
@@ -344,9 +346,7 @@ def _sinc(x: Tensor) -> Tensor:
     return torch.where(small, 1 - x**2 / 6, torch.sin(safe) / safe)
 
 
-def parallelogram_integral(
-    wave_vector: Vectors, first: Vectors, second: Vectors
-) -> Float64[Tensor, " row"]:
+def parallelogram_integral(wave_vector: Vectors, first: Vectors, second: Vectors) -> _Values:
     """Mean of exp(j w·x) over a parallelogram centred at the origin.
 
     Args:
@@ -433,9 +433,7 @@ def triangle_normals(corners: Float64[Tensor, "*row 3 3"]) -> Float64[Tensor, "*
 
 
 def interpolate_vectors(
-    values: Float64[Tensor, "*#row 3 3"],
-    corners: Float64[Tensor, "*#row 3 3"],
-    points: Float64[Tensor, "*#row 3"],
+    values: _Triangles, corners: _Triangles, points: Float64[Tensor, "*#row 3"]
 ) -> Float64[Tensor, "*row 3"]:
     """Interpolate vectors given at the corners of triangles.
 
@@ -448,7 +446,7 @@ def interpolate_vectors(
 
 
 def barycentric_coordinates(
-    corners: Float64[Tensor, "*#row 3 3"], points: Float64[Tensor, "*#row 3"]
+    corners: _Triangles, points: Float64[Tensor, "*#row 3"]
 ) -> Float64[Tensor, "*row 3"]:
     """Barycentric coordinates of points in triangles.
 

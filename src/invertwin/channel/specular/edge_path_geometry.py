@@ -18,6 +18,7 @@ coplanar skew edges", IEEE TAP 45, 1997.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Complex128, Float64
@@ -27,6 +28,7 @@ from invertwin.channel.em import utd
 from invertwin.channel.em.plane_waves import cross, dot
 from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 
+Vectors: TypeAlias = Float64[Tensor, "row 3"]
 _MAX_STEPS = 40  # of the search for the shortest path over several edges
 _LIFTS = (0.1, 0.01, 0.0)  # of the antennas' distance, in this order
 _COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-3, 1e-13  # of the antennas' distance: convergence
@@ -77,12 +79,7 @@ class EdgePaths:
 
 
 def diffract_over_edges(
-    edges: Sequence[PathEdge],
-    tx: Float64[Tensor, "row 3"],
-    rx: Float64[Tensor, "row 3"],
-    wave_number: float,
-    *,
-    slopes: bool = False,
+    edges: Sequence[PathEdge], tx: Vectors, rx: Vectors, wave_number: float, *, slopes: bool = False
 ) -> EdgePaths:
     """Compute the diffracted field of one edge, or of two or three consecutive edges.
 
@@ -131,7 +128,7 @@ def transfer_dyads(
 
 
 def multiple_diffraction_points(
-    wedges: Sequence[Wedges], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
+    wedges: Sequence[Wedges], tx: Vectors, rx: Vectors
 ) -> tuple[Float64[Tensor, "row edge 3"], Bool[Tensor, " row"]]:
     """Diffraction points of paths, on the lines of their edges, and a mask of existing paths.
 
@@ -334,9 +331,7 @@ def _azimuth(wedges: Wedges, direction: Tensor, known: Tensor | None) -> Tensor:
     return found if known is None else torch.where(known.isnan(), found, known)
 
 
-def find_route(
-    edges: Sequence[PathEdge], tx: Float64[Tensor, "row 3"], rx: Float64[Tensor, "row 3"]
-) -> Route:
+def find_route(edges: Sequence[PathEdge], tx: Vectors, rx: Vectors) -> Route:
     """Find the shortest path: in closed form over one edge, by Newton's method over more.
 
     Args:

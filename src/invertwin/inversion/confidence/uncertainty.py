@@ -29,6 +29,7 @@ _WEAK_VARIANCE = 1 / 16  # spans squared: directions with more variance are prof
 _PROFILE_DISTANCE = 2.0  # spans: displacement of a profiled direction
 _PROFILE_REFITS = 3  # Gauss–Newton steps of the other coordinates
 _MIN_LOSS_RISE = 1e-3  # lower limit of the rise of the loss, relative to the quadratic model
+_UNFINISHED_SHARE = 0.7  # of a deviation, half of whose variance then is the way to the minimum
 _SIZE_DEVIATION = 0.1  # of the sizes of objects whose pose alone is fitted, before the data
 
 
@@ -52,6 +53,8 @@ class Uncertainty:
         source: ``looks`` (realisations of the twin) or ``frames`` of the data.
         size_errors: root mean square error of the size of every object whose pose alone is fitted,
             relative, given the data and a deviation of a tenth before them.
+        newton_step: distance of every coordinate from the minimum of the loss, in its unit; empty
+            if unknown. It is part of the covariance.
     """
 
     names: tuple[str, ...]
@@ -61,11 +64,22 @@ class Uncertainty:
     count: int
     source: Literal["looks", "frames"]
     size_errors: Mapping[str, float] = field(default_factory=dict)
+    newton_step: tuple[float, ...] = ()
 
     @property
     def deviations(self) -> dict[str, float]:
         """Standard deviation of every coordinate, in its unit."""
         return dict(zip(self.names, self.covariance.diagonal().sqrt().tolist(), strict=True))
+
+    @property
+    def unfinished(self) -> tuple[str, ...]:
+        """A sentence for every coordinate that is farther from the minimum than its uncertainty."""
+        rows = zip(self.names, self.units, self.newton_step, self.deviations.values(), strict=False)
+        return tuple(
+            f"{name}: the fit stopped {step:.2g} {unit} before its minimum; give it more steps"
+            for name, unit, step, deviation in rows
+            if step > _UNFINISHED_SHARE * deviation
+        )
 
     @property
     def correlations(self) -> Float64[Tensor, "p p"]:
@@ -95,7 +109,8 @@ class CovarianceEstimator:
 
     An object whose pose alone is fitted has a size n of deviation σ = 0.1. The gradient of the loss
     by n, at coordinates that follow, is a linear measurement of it. By the mean square of n given
-    this measurement the coordinates are displaced, ``H_θθ⁻¹ H_θn n`` (consider parameters).
+    this measurement the coordinates are displaced, ``H_θθ⁻¹ H_θn n`` (consider parameters). So they
+    are by the Newton step, ``−H⁻¹ g``, from the estimate to the minimum.
 
     Source: the sandwich covariance of estimators, derivations §16; Schmidt, "Application of
     state-space methods to navigation problems", Advances in Control Systems 3, 1966.
@@ -104,14 +119,17 @@ class CovarianceEstimator:
 
     Args:
         result: result of the fit.
-        size_errors: whether sizes that the fit holds are uncertain.
+        is_fitted: whether the estimate comes from a fit: sizes that it holds are uncertain, and it
+            may have stopped before the minimum (told without regularisers only).
 
     Raises:
         InputError: More than 64 coordinates, or a loss without a curvature.
     """
 
-    def __init__(self, result: FitResult, *, size_errors: bool = False) -> None:
-        self._sizes = _find_held_sizes(result.fit) if size_errors else []
+    def __init__(self, result: FitResult, *, is_fitted: bool = False) -> None:
+        with torch.enable_grad():
+            self._may_move = is_fitted and not result.fit.penalty().requires_grad
+        self._sizes = _find_held_sizes(result.fit) if is_fitted else []
         fit = result.fit.copy(*map(Scale, self._sizes))
         found = list(iterate_coordinates(fit.modules))
         others = [x for x in fit.objective.losses if not isinstance(x, CURVED)]
@@ -173,6 +191,10 @@ class CovarianceEstimator:
         blind = tuple(_describe_unobserved(found, covariance))
         names, units = tuple(c.name for c in found), tuple(c.unit for c in found)
         bars = Uncertainty(names, units, covariance * square, blind, count, by)
+        if self._may_move:
+            step = -(inverse * square) @ _project([slopes], rows[0])[0, own]
+            moved = bars.covariance + torch.outer(step, step)
+            bars = replace(bars, covariance=moved, newton_step=tuple(step.abs().tolist()))
         if not sizes:
             return bars
         shift = (inverse * square) @ curvature[own, len(found) :]

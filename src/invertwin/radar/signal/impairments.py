@@ -11,7 +11,7 @@ import warnings
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from invertwin.radar.waveform import FMCW, PhysicsWarning, SteppedFrequency
 
 # Phase step of the highest offset between delays of the residual: the error of linear
 # interpolation is below 1 %.
+
+_Beat: TypeAlias = Complex128[Tensor, "frame *chirp tx rx sample"]
 _DELAY_STEP = 0.25
 # Frequency resolution relative to that of one sweep, so that noise is not periodic in it.
 _OSCILLATOR_OVERSAMPLING = 4
@@ -160,7 +162,7 @@ class Impairments:
 
     def record(
         self, paths: Paths, radar: Radar, *, seed: int, chirps: Chirps | None = None
-    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+    ) -> _Beat:
         """Simulate the paths with these impairments, in single ramps or a chirp train.
 
         Each impairment draws from its own stream of the seed, so adding one does not change the
@@ -184,9 +186,7 @@ class Impairments:
             beat = _ideal_beat(paths, radar, chirps)
         return self._add_receiver_effects(beat, radar, seed, chirps)
 
-    def apply(
-        self, beat: Complex128[Tensor, "frame *chirp tx rx sample"], radar: Radar, *, seed: int
-    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+    def apply(self, beat: _Beat, radar: Radar, *, seed: int) -> _Beat:
         """Add all impairments except phase noise to a beat signal of frames or trains.
 
         Args:
@@ -210,7 +210,7 @@ class Impairments:
 
     def _add_receiver_effects(
         self, beat: Tensor, radar: Radar, seed: int, chirps: Chirps | None
-    ) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+    ) -> _Beat:
         streams = _streams(seed)
         if self.leakage is not None:
             if radar.range_origin is not None:
@@ -241,7 +241,7 @@ def _streams(seed: int) -> list[int]:
 
 def noisy_oscillator_beat(
     paths: Paths, radar: Radar, noise: PhaseNoise, *, seed: int, chirps: Chirps | None = None
-) -> Complex128[Tensor, "frame *chirp tx rx sample"]:
+) -> _Beat:
     """Compute beat signals with one oscillator of phase noise φ for transmitter and mixer.
 
         s'[n] = Σ s_i[n] exp(j (φ(t_n) − φ(t_n − τ_i)))

@@ -4,7 +4,7 @@ import math
 from functools import cache, lru_cache
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import finufft
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from invertwin.radar.waveform import SampledWaveform
 
+_Delays: TypeAlias = Float64[Tensor, "instant path"]
 _SHARED_PATHS = 20_000  # minimum number of paths for several threads
 
 
@@ -69,7 +70,7 @@ def _weights(count: int) -> Float64[Tensor, " instant"]:
 
 def beat_of_delays(
     coefficient: Complex128[Tensor, " path"],
-    delay: Float64[Tensor, "instant path"],
+    delay: _Delays,
     waveform: SampledWaveform,
     tolerance: float,
 ) -> Complex128[Tensor, " sample"]:
@@ -99,9 +100,7 @@ def beat_of_delays(
     return sums[0] if count == 1 else (sums * _interpolation(samples, count).to(sums)).sum(0)
 
 
-def phase_cycles(
-    delay: Float64[Tensor, "instant path"], waveform: SampledWaveform
-) -> Float64[Tensor, "instant path"]:
+def phase_cycles(delay: _Delays, waveform: SampledWaveform) -> _Delays:
     """Return the phase of paths at ``ramp_instants``, ``f τ − S τ²/2`` [cycles].
 
     Args:

@@ -23,7 +23,7 @@ displaced ray (Fermat). It enters the delay, never the coefficient, so nothing i
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float64
@@ -34,6 +34,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import LEAST_COSINE, FieldCoefficients
 
+_Angles: TypeAlias = Float64[Tensor, "*angle"]
 _ONE = torch.ones((), dtype=torch.float64)
 
 
@@ -56,9 +57,9 @@ class SlabLayer(NamedTuple):
 class SlabTables(NamedTuple):
     """Power coefficients of a slab, averaged over both polarisations, and its extra length [m]."""
 
-    reflectance: Float64[Tensor, "*angle"]
-    transmittance: Float64[Tensor, "*angle"]
-    extra_length: Float64[Tensor, "*angle"]
+    reflectance: _Angles
+    transmittance: _Angles
+    extra_length: _Angles
 
 
 class _Response(NamedTuple):
@@ -76,7 +77,7 @@ class _Response(NamedTuple):
 
 
 def slab_coefficients(
-    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
+    layers: Sequence[SlabLayer], cos_theta: _Angles, frequency: float
 ) -> FieldCoefficients:
     """Compute complex field coefficients of a stack of layers in air, for both polarisations.
 
@@ -95,7 +96,7 @@ def slab_coefficients(
 
 
 def sheet_coefficients(
-    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
+    layers: Sequence[SlabLayer], cos_theta: _Angles, frequency: float
 ) -> FieldCoefficients:
     """Compute coefficients of a stack for rays that treat its mesh as a sheet without thickness.
 
@@ -120,9 +121,7 @@ def sheet_coefficients(
     return FieldCoefficients(*(turn * value for value in faces))
 
 
-def slab_tables(
-    layers: Sequence[SlabLayer], cos_theta: Float64[Tensor, "*angle"], frequency: float
-) -> SlabTables:
+def slab_tables(layers: Sequence[SlabLayer], cos_theta: _Angles, frequency: float) -> SlabTables:
     """Compute reflectance, transmittance and extra length of a stack of layers in air.
 
     Power coefficients are the mean of both polarisations; so is the extra length, weighted by the

@@ -24,7 +24,7 @@ and exactly R where both angles agree.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
 from invertwin.scene.material.slab import SlabLayer, sheet_coefficients
 
+_Values: TypeAlias = Float64[Tensor, " n"]
 ANGLE_COUNT = 256
 """Nodes of the tables over the angle of incidence, at cosθ = linspace(0, 1, 256)."""
 LOBE_COUNT = 3
@@ -154,9 +155,7 @@ class SmoothInterface(NamedTuple):
         )
         return SmoothInterface(epsilon, *others)  # type: ignore[arg-type]
 
-    def coherent_reflection(
-        self, frequency: float, cosine: Float64[Tensor, " n"]
-    ) -> Float64[Tensor, " n"]:
+    def coherent_reflection(self, frequency: float, cosine: _Values) -> _Values:
         """Return the coherent fraction of the reflected field: roughness spreads phases by 2kσ
         cosθ.
 
@@ -190,7 +189,7 @@ class Material(ABC):
         return SmoothInterface(None, _INFINITE, _ONE, _ZERO) if self.coherent else None
 
     def coefficients(
-        self, frequency: float, cosine: Float64[Tensor, " n"], triangle: Int64[Tensor, " n"]
+        self, frequency: float, cosine: _Values, triangle: Int64[Tensor, " n"]
     ) -> FieldCoefficients:
         """Return coherent field coefficients of reflection and transmission, about the mesh.
 
