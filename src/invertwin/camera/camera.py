@@ -13,6 +13,7 @@ from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.parameters import RigidMotion
+from invertwin.scene.pose import rotate_about_mean
 
 _MAX_PIXELS = 1 << 26
 
@@ -120,12 +121,8 @@ class Camera:
             rotation: world rotation matrix [3, 3].
             translation: world translation [3] [m].
         """
-        middle = self.positions.mean(0)
-        return replace(
-            self,
-            positions=middle + (self.positions - middle) @ rotation.T + translation,
-            rotations=rotation @ self.rotations,
-        )
+        places = rotate_about_mean(self.positions, rotation) + translation
+        return replace(self, positions=places, rotations=rotation @ self.rotations)
 
     def detach(self) -> "Camera":
         """Return the camera without derivatives."""

@@ -20,6 +20,7 @@ from invertwin.limits import MAX_COUNT, MAX_LENGTH, AllowedValues
 from invertwin.radar.waveform import WINDOWS, PhysicsWarning, SampledWaveform, Waveform
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.antenna import AntennaArray
+from invertwin.scene.pose import rotate_about_mean
 
 Window = Annotated[str, AllowedValues(WINDOWS)]
 Cosine = Annotated[float, Gt(0), Le(1)]
@@ -220,12 +221,8 @@ class Radar:
             rotation: world rotation matrix [3, 3].
             translation: world translation [3] [m].
         """
-        center = self.positions.mean(0)
-        return replace(
-            self,
-            positions=center + (self.positions - center) @ rotation.T + translation,
-            rotations=rotation @ self._rotations,
-        )
+        places = rotate_about_mean(self.positions, rotation) + translation
+        return replace(self, positions=places, rotations=rotation @ self._rotations)
 
     def frames(self, indices: Sequence[int] | Int64[Tensor, " chosen"]) -> "Radar":
         """Return the radar with selected poses."""

@@ -41,6 +41,17 @@ def vector_from_quaternion(quaternion: Float[Tensor, "4"]) -> Float[Tensor, "3"]
     return torch.where(sine > 0, 2 * torch.atan2(sine, unit[0]) / sine, 2.0) * unit[1:]
 
 
+def rotate_about_mean(points: Float64[Tensor, "n 3"], rotation: Float64[Tensor, "3 3"]) -> Tensor:
+    """Rotate points about their mean.
+
+    Args:
+        points: positions [m].
+        rotation: rotation matrix.
+    """
+    center = points.mean(0)
+    return center + (points - center) @ rotation.T
+
+
 def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation matrix of a quaternion (w, x, y, z) of any non-zero length.
 

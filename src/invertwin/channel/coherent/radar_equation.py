@@ -103,10 +103,8 @@ class PathTransfer:
         Args:
             kind, given: Arguments of ``make_paths``.
         """
-        delay, ends = self.length / SPEED_OF_LIGHT, (self.points[0], self.points[-1])
-        return make_paths(
-            self.frame, delay, *(point.position for point in ends), kind=kind, **given
-        )
+        ends = self.points[0].position, self.points[-1].position
+        return make_paths(self.frame, self.length / SPEED_OF_LIGHT, *ends, kind=kind, **given)
 
 
 def radar_equation(

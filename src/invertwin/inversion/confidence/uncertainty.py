@@ -29,7 +29,6 @@ _WEAK_VARIANCE = 1 / 16  # spans squared: directions with more variance are prof
 _PROFILE_DISTANCE = 2.0  # spans: displacement of a profiled direction
 _PROFILE_REFITS = 3  # Gauss–Newton steps of the other coordinates
 _MIN_LOSS_RISE = 1e-3  # lower limit of the rise of the loss, relative to the quadratic model
-_UNFINISHED_SHARE = 0.7  # of a deviation, half of whose variance then is the way to the minimum
 _SIZE_DEVIATION = 0.1  # of the sizes of objects whose pose alone is fitted, before the data
 
 
@@ -78,7 +77,7 @@ class Uncertainty:
         return tuple(
             f"{name}: the fit stopped {step:.2g} {unit} before its minimum; give it more steps"
             for name, unit, step, deviation in rows
-            if step > _UNFINISHED_SHARE * deviation
+            if step > 0.7 * deviation  # half of the variance
         )
 
     @property
