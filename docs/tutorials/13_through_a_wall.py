@@ -69,8 +69,8 @@ bars = fit.uncertainty.interval()
 print(f"{fit.verdict.word}: {100 * miss.norm():.1f} cm off")
 print({name: f"± {100 * value:.1f} cm" for name, value in bars.items()})
 assert miss.norm() < 0.05
-assert not fit.uncertainty.unfinished
+assert not fit.uncertainty.early_stops
 
 # %% [markdown]
-# `unfinished` would name parameters for which the steps were too few. Try: Adam with 30 steps (no `optimizer`), which
+# `early_stops` would name parameters for which the steps were too few. Try: Adam with 30 steps (no `optimizer`), which
 # stops early; a wall of concrete (`Slab.itu("concrete", thickness=0.1)`), through which next to nothing passes.

@@ -80,8 +80,8 @@ def test_a_fit_that_stops_early_says_how_far_from_its_minimum():
         (step,) = fit.uncertainty.newton_step
         assert fit.uncertainty.deviations["ball.y"] > step
         assert step == pytest.approx(way, rel=0.3, abs=0.1 * alone)
-    assert done.uncertainty.unfinished == ()
-    (sentence,) = early.uncertainty.unfinished
+    assert done.uncertainty.early_stops == ()
+    (sentence,) = early.uncertainty.early_stops
     assert sentence.startswith("ball.y: the fit stopped 0.0")
     assert "before its minimum; give it more steps" in sentence
 

@@ -52,7 +52,7 @@ def error_bar_metrics(uncertainty: Uncertainty) -> dict[str, Any]:
         "correlations": uncertainty.correlations,
         "unobserved": list(uncertainty.unobserved),
         "size_errors": dict(uncertainty.size_errors),
-        "unfinished": list(uncertainty.unfinished),
+        "early_stops": list(uncertainty.early_stops),
     }
 
 

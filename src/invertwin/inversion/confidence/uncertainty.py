@@ -71,7 +71,7 @@ class Uncertainty:
         return dict(zip(self.names, self.covariance.diagonal().sqrt().tolist(), strict=True))
 
     @property
-    def unfinished(self) -> tuple[str, ...]:
+    def early_stops(self) -> tuple[str, ...]:
         """A sentence for every coordinate that is farther from the minimum than its uncertainty."""
         rows = zip(self.names, self.units, self.newton_step, self.deviations.values(), strict=False)
         return tuple(
