@@ -99,8 +99,10 @@ def simulate(
             "expected the noise level in the impairments, got one beside them; give "
             "Impairments(snr_db=...)"
         )
-    how: Any = {"sampling": sampling or Sampling(), "seed": seed, "speckle": speckle}
-    paths = channel.trace_field_with_mirrors(scene, radar.link(), mirrors, **how)
+    plan = sampling or Sampling()
+    paths = channel.trace_field_with_mirrors(
+        scene, radar.link(), mirrors, sampling=plan, seed=seed, speckle=speckle
+    )
     if impairments is not None:
         beat = impairments.record(paths, radar, seed=seed)
     else:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -149,10 +148,12 @@ class ShapeLikelihood:
             steps: number of steps.
         """
         unknowns = self.unknowns(shapes)
+        scene, adam = self.build_scene(shapes), Optimizer("adam", rate=_LEARNING_RATE)
         seen = Observation(self.model, self.power, sensor=self.radar)
-        rules: Any = {"optimizer": Optimizer("adam", rate=_LEARNING_RATE), "loss": self.loss}
-        plan: Any = {"schedule": Schedule(steps, annealing=0.5), "seed": self.seed}
-        found = reconstruct(self.build_scene(shapes), seen, unknowns, **rules, **plan)
+        plan = Schedule(steps, annealing=0.5)
+        found = reconstruct(
+            scene, seen, unknowns, loss=self.loss, optimizer=adam, schedule=plan, seed=self.seed
+        )
         return [one.shape for one in unknowns.values()], found
 
 

@@ -226,9 +226,10 @@ def _antenna_silhouette_paths(
         return walker.run(state, depth, visit_connection)
 
     for number, (sign, passed) in enumerate(samples.sides(fixed)):
-        power, length = throughput * passed.transmittance * sign, distance + passed.extra_length
-        begin = samples.index, frame, shadow, incident, power, length
-        state = walk.initial_state(*begin, passed if fixed.surfaces.has_sheets else None)
+        power = throughput * passed.transmittance * sign
+        length = distance + passed.extra_length
+        sheets = passed if fixed.surfaces.has_sheets else None
+        state = walk.initial_state(samples.index, frame, shadow, incident, power, length, sheets)
         if not isinstance(at_receiver, bool):
             state = walk.update_state(state, u=departure.y, v=departure.z, to_receiver=~at_receiver)
         # Anew for each side: a derivative consumes the graph of the velocity.
@@ -273,8 +274,8 @@ def _interior_silhouette_paths(
     for number, (sign, passed) in enumerate(samples.sides(fixed)):
         power = done["power"] * passed.transmittance * sign
         length = done["optical_length"] + distance + passed.extra_length
-        begin = samples.index + _SECOND_PART_OFFSET, samples.frame, shadow, to_behind
-        state = walk.initial_state(*begin, power, length)
+        index = samples.index + _SECOND_PART_OFFSET
+        state = walk.initial_state(index, samples.frame, shadow, to_behind, power, length)
         state = walk.update_state(
             state, u=done["u"], v=done["v"], to_receiver=~ends_at_receiver, previous_vertices=count
         )

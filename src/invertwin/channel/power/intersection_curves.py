@@ -302,11 +302,12 @@ class _CoveredSide:
         """Create the state of the paths at the curve, for unit velocity."""
         before, points = self.subpath, self.subpath.points
         passed = self.transmit(before.incident)
-        place = points.frame, (points.first, points.second)[self.own], before.incident
+        point = (points.first, points.second)[self.own]
         throughput = before.throughput * passed.transmittance * self.sign
-        begin = points.index + _SUBPATH_OFFSET, *place, throughput
-        length, shared = before.length + passed.extra_length, before.shared
-        state = walk.initial_state(*begin, length, points.transmission if shared else None)
+        length = before.length + passed.extra_length
+        sheets = points.transmission if before.shared else None
+        index, incident = points.index + _SUBPATH_OFFSET, before.incident
+        state = walk.initial_state(index, points.frame, point, incident, throughput, length, sheets)
         return walk.update_state(state, **before.keys)
 
     def speed(self, inputs: Inputs) -> mit.Float:

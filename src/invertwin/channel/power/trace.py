@@ -173,12 +173,12 @@ class PowerTracer:
         departure = integrand.to_radar_frame(self.fixed, start.frame, -incident)
         gain = self.fixed.gain(start.frame, False, departure)
         weight = start.weight * passed.transmittance * self.fixed.scale * gain / dr.square(distance)
-        throughput, length = (
-            dr.select(start.weight > 0, weight, 0.0),
-            distance + passed.extra_length,
+        throughput = dr.select(start.weight > 0, weight, 0.0)
+        length = distance + passed.extra_length
+        sheets = passed if self.fixed.surfaces.has_sheets else None
+        return walk.initial_state(
+            index, start.frame, start.point, incident, throughput, length, sheets
         )
-        begin = index, start.frame, start.point, incident, throughput, length
-        return walk.initial_state(*begin, passed if self.fixed.surfaces.has_sheets else None)
 
     @cached_property
     def boundary_samples(self) -> BoundarySamples | None:

@@ -308,15 +308,17 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
         own = replace(problem, run=run.apply_overrides(table))
         schedule, (model,) = own.run.fit_settings.build(), own.kind.models(own)
         with inversion.report_progress("calibration", schedule.steps, console) as shown:
-            how: Any = {"loss": build.build_loss(run), "schedule": schedule, "seed": run.seed}
-            how["optimizer"] = build.build_section(own.run, "optimizer")
-            how["callbacks"] = [
-                *shown,
-                _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt"),
-            ]
-            known: Any = {"sensor": item.sensor, "parameters": [bias, clock]}
-            seen = inversion.Observation(model, capture, **known)
-            found = inversion.reconstruct(Scene({table.object: target}), seen, [], **how)
+            kept = _make_checkpoint(problem, folder, f"{PARTS}/calibration.pt")
+            found = inversion.reconstruct(
+                Scene({table.object: target}),
+                inversion.Observation(model, capture, sensor=item.sensor, parameters=[bias, clock]),
+                [],
+                loss=build.build_loss(run),
+                optimizer=build.build_section(own.run, "optimizer"),
+                schedule=schedule,
+                callbacks=[*shown, kept],
+                seed=run.seed,
+            )
         offset = capture.clock_offset + float(clock.shift.detach())
         capture = capture.recalibrate(offset, capture.range_bias + float(bias.bias.detach()))
         row = {"loss": found.loss, "status": found.status}
