@@ -273,7 +273,9 @@ def test_looks_have_other_phases_of_targets():
 
 
 def test_targets_are_given_by_names_and_the_stretch_needs_some():
-    with pytest.raises(InputError, match="expected a list of names of coherent targets"):
+    with pytest.raises(
+        InputError, match="expected a list of names of objects, got 'target'; give coher"
+    ):
         SurrogateMap(GRID, coherent="target")
     for stretch, names in ((2.0, []), (0.5, ["target"])):
         with pytest.raises(InputError, match="expected a stretch >= 1 of coherent targets"):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -211,8 +210,8 @@ def test_a_moving_ghost_has_the_velocity_of_the_image(power):
     how = {"sampling": replace(SAMPLING, points_per_m2=20_000.0, boundary=False), "seed": 1}
     trace = trace_mirrored_power if power else trace_field_with_mirrors
     paths = trace(moving(), link(), ["wall"], **how)
-    radar = SimpleNamespace(link=link)
-    rates, weights = range_rate(paths, radar), paths.power + paths.coefficient.abs().square()
+    rates = range_rate(paths, chirp_radar())  # at the antennas' place
+    weights = paths.power + paths.coefficient.abs().square()
     own, image = image_rates()
     seen_last = paths.direction_cosines(link())[:, 0] < -0.2  # the receiver sees the image
     velocity = paths.velocity
