@@ -164,7 +164,7 @@ def simulate_chirps(
         impairments.check_applicable()
     motion = scene.advance if isinstance(scene, Scene) else scene
     plan = sampling or (Sampling() if mirrors else Sampling(depth=1))
-    _check_tracing(plan, again, visibility_every, mirrors)
+    _check_tracing(plan, again, retrace, visibility_every, mirrors)
     if not (speckle or mirrors):  # one trace draws its own points; those of several are the same
         speckle = channel.draw_speckle(motion(0.0), radar.link(), plan, seed)
 
@@ -195,9 +195,9 @@ def simulate_chirps(
 
 
 def _check_tracing(
-    plan: Sampling, again: bool, visibility_every: int, mirrors: Collection[str]
+    plan: Sampling, again: bool, retrace: bool, visibility_every: int, mirrors: Collection[str]
 ) -> None:
-    """Raise an error for mirrors, or kept visibility, that the way of tracing has not."""
+    """Raise an error for mirrors or kept visibility that this tracing does not support."""
     if mirrors and again:
         raise InputError(
             f"expected uniform velocities with mirrors, got {len(mirrors)} mirrors and motion that "
@@ -205,7 +205,7 @@ def _check_tracing(
         )
     if checked_count(visibility_every, "visibility_every", 1) > 1 and (plan.depth > 1 or not again):
         raise InputError(
-            f"expected visibility_every 1 with {plan.depth} bounces and retrace={again}, got "
+            f"expected visibility_every 1 with {plan.depth} bounces and retrace={retrace}, got "
             f"{visibility_every}; it is for paths of one bounce of a function of time"
         )
 

@@ -217,7 +217,7 @@ def make_paths(
     """Paths of one kind; power or coefficient that are not given are zero.
 
     Args:
-        frame, delay, first, last, kind: What ``Paths`` holds.
+        frame, delay, first, last, kind: Columns of ``Paths``.
         given: Other columns; ``boundary`` is True if all of them are boundary paths.
     """
     zero, boundary = torch.zeros_like(delay), given.pop("boundary", False)

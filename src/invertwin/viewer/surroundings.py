@@ -72,6 +72,7 @@ def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
     middle = 0.5 * (points.min(0) + points.max(0)).astype(float)
     away = points - middle
     above = np.cross(right, sight)
+    # On narrow screens names of objects stand in the margin.
     aside = np.maximum(np.abs(away @ right) / min(0.85 * aspect, 1.0), np.abs(away @ above))
     distance = float((aside / _USED_TANGENT - away @ sight).max()) or 1.0
     camera.fov, camera.near, camera.far = _FIELD_OF_VIEW, 1e-3 * distance, 1e2 * distance

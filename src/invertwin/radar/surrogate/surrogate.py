@@ -283,12 +283,12 @@ def surrogate_spectrum(
     if set(scene.objects) - set(coherent):
         rest = channel.as_absorbers(scene, coherent)
         drawn: dict[str, Any] = {"sampling": sampling, "seed": seed}
-        how = dict(drawn)
+        fixed: dict[str, Any] = {}
         if reference is not None:
-            fixed = channel.as_absorbers(reference[0], coherent), reference[1]
-            how |= {"reference": fixed, "scheme": reference[2]}
+            densities = channel.as_absorbers(reference[0], coherent), reference[1]
+            fixed = {"reference": densities, "scheme": reference[2]}
         bare = channel.without_specular(rest, mirrors)
-        parts.append(channel.deposit_power(bare, link, grid, **how))
+        parts.append(channel.deposit_power(bare, link, grid, **drawn, **fixed))
         if mirrors:
             parts.append(channel.deposit_mirrored_power(rest, link, grid, mirrors, **drawn))
     return surrogate.shape(torch.stack(parts).sum(0), radar, grid).clamp_min(0.0)
