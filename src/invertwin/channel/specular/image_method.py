@@ -10,6 +10,7 @@ by four slightly shifted rays, and where they disagree, a float64 test over all 
 Source: derivations §10.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -286,10 +287,8 @@ class _SequenceScreen:
         source = dr.gather(mi.UInt32, arrays.to_index(source_index), target)
         first = (source * count + row) * (self.length + 1)
         active, corners, planes, normals = self._intersect_planes(row, first, end)
-        valid = arrays.to_torch(
-            self._is_unobstructed(first, active, [*corners, end], planes, normals)
-        )
-        keep = torch.nonzero(valid)[:, 0]
+        free = self._is_unobstructed(first, active, [*corners, end], planes, normals)
+        keep = torch.nonzero(arrays.to_torch(free))[:, 0]
         return keep // self.count, keep % self.count
 
     def _intersect_planes(
@@ -468,17 +467,13 @@ def _test_segments(
     second = waves.cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
     faces, end_plane = torch.full_like(votes, -1), segments.plane.maximum(segments.target_plane)
-    for number in range(4):  # the last ray is not shifted
-        angle = torch.tensor(2.1 * number, dtype=torch.float64)
-        offset = _RAY_SPREAD * surfaces.margin * (angle.cos() * first + angle.sin() * second)
-        if number == 3:
-            offset = torch.zeros_like(offset)
+    for number in range(4):
+        spread = _RAY_SPREAD * surfaces.margin * (number < 3)  # the last ray is not shifted
+        offset = spread * (math.cos(2.1 * number) * first + math.sin(2.1 * number) * second)
         start = segments.start + _shift_in_plane(surfaces, offset, unit, segments.plane_before)
         end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
-        face = _cast_rays(surfaces, start, end, segments)
-        valid = torch.where(segments.plane >= 0, face >= 0, face == -1)
-        votes += valid
-        faces = face
+        faces = _cast_rays(surfaces, start, end, segments)
+        votes += torch.where(segments.plane >= 0, faces >= 0, faces == -1)
     undecided = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
     valid = votes == 4
     if len(undecided):
@@ -508,9 +503,8 @@ def _cast_rays(
     before = planes.normal[segments.plane_before.clamp_min(0)]
     offset = torch.where(segments.plane_before >= 0, margin * waves.dot(unit, before).sign(), 0.0)
     end_plane = torch.maximum(segments.plane, segments.target_plane)
-    excess = (
-        2 * margin / waves.dot(unit, planes.normal[end_plane.clamp_min(0)]).abs().clamp_min(1e-3)
-    )
+    slope = waves.dot(unit, planes.normal[end_plane.clamp_min(0)]).abs()
+    excess = 2 * margin / slope.clamp_min(1e-3)
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
     origin = arrays.to_vectors(mi.Point3f, start + offset[:, None] * before)
     direction = arrays.to_vectors(mi.Vector3f, unit)
@@ -528,36 +522,40 @@ def _test_exactly(
     surfaces: CandidateSurfaces, segments: _SpecularSegments
 ) -> tuple[Tensor, Tensor]:
     """Test segments in float64 over all triangles, which include their edges."""
-    planes, vertices = surfaces.planes, surfaces.exact_vertices
-    corners = vertices[surfaces.topology.faces]
+    own, corners = surfaces.planes.face_plane, surfaces.exact_vertices[surfaces.topology.faces]
     a, b, c = corners.unbind(1)
-    area = waves.cross(b - a, c - a)
+    area, center = waves.cross(b - a, c - a), (a + b + c) / 3
+    radius = (corners - center[:, None]).norm(dim=2).amax(1) + surfaces.margin
     valid = torch.ones(len(segments.start), dtype=torch.bool)
-    hit_faces = torch.full((len(valid),), -1)
+    hit_faces, least = torch.full((len(valid),), -1), torch.full((len(valid),), -torch.inf).double()
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
     # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
     gap = torch.where(segments.plane.maximum(segments.target_plane) < 0, surfaces.margin, tolerance)
-    for row in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
-        start, end = segments.start[row, None], segments.end[row, None]
-        direction = end - start
-        length = direction.norm(dim=2)
-        slope = waves.dot(direction, area)
-        fraction = waves.dot(a - start, area) / replace_zeros(slope)
-
-        def inside(point: Tensor) -> Tensor:
-            return waves.barycentric_coordinates(corners, point).amin(2)
-
-        own = planes.face_plane
-        ends = (own == segments.plane_before[row, None]) | (own == segments.plane[row, None])
-        ends |= (own == segments.target_plane[row, None]) & (own >= 0)
-        between = (fraction * length > tolerance) & (fraction * length < length - gap[row, None])
-        crossing = between & (slope != 0) & ~ends & (own >= 0)
-        blocked = crossing & (inside(start + fraction[..., None] * direction) >= -rim)
-        best, face = torch.where(own == segments.plane[row, None], inside(end), -torch.inf).max(1)
-        surface = segments.plane[row] >= 0
-        hit_faces[row] = torch.where(surface, face, -1)
-        valid[row] = ~blocked.any(1) & (~surface | (best >= -rim))
-    return valid, hit_faces
+    for rows in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
+        unit = normalize(segments.end[rows] - segments.start[rows], dim=1)
+        along = unit @ center.T - waves.dot(unit, segments.start[rows])[:, None]
+        square = torch.cdist(segments.start[rows], center).square() - along.square()
+        near, face = torch.nonzero(square <= radius.square(), as_tuple=True)
+        row = rows[near]
+        start, end = segments.start[row], segments.end[row]
+        length, slope = (end - start).norm(dim=1), waves.dot(end - start, area[face])
+        fraction = waves.dot(a[face] - start, area[face]) / replace_zeros(slope)
+        plane, other = own[face], segments.target_plane[row]
+        ends = (plane == segments.plane_before[row]) | (plane == segments.plane[row])
+        ends |= (plane == other) & (plane >= 0)
+        between = (fraction * length > tolerance) & (fraction * length < length - gap[row])
+        crossing = torch.nonzero(between & (slope != 0) & ~ends & (plane >= 0))[:, 0]
+        point = start + fraction[:, None] * (end - start)
+        inner = waves.barycentric_coordinates(corners[face[crossing]], point[crossing]).amin(1)
+        valid[row[crossing[inner >= -rim]]] = False
+        own_plane = torch.nonzero((plane == segments.plane[row]) & (plane >= 0))[:, 0]
+        row, face = row[own_plane], face[own_plane]
+        inner = waves.barycentric_coordinates(corners[face], end[own_plane]).amin(1)
+        least.scatter_reduce_(0, row, inner, "amax")
+        best = inner == least[row]
+        hit_faces[row[best]] = face[best]
+    surface = segments.plane >= 0
+    return valid & (~surface | (least >= -rim)), hit_faces
 
 
 @dataclass(frozen=True)
