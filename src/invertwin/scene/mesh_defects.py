@@ -107,14 +107,13 @@ def find_doubled_faces(
     """
     corners, part = places[faces], mesh_topology.find_parts(faces, places)
     distinct = mesh_topology.find_distinct_faces(faces, places)
-    doubled = ~mesh_topology.find_slivers(corners)
+    doubled = ~mesh_topology.find_slivers(faces, places)
     doubled[distinct] = False  # all but the first of each kind remain
     near = distinct[mesh_topology.near_other_parts(corners[distinct], part[distinct])]
-    small, large = near[_find_near_pairs(corners[near])]
-    other = part[small] != part[large]
-    small, large = small[other], large[other]
-    on = _overlap_in_plane(corners[large], corners[small])
-    doubled[small[on]] = doubled[large[on]] = True
+    pairs = near[_find_near_pairs(corners[near])]
+    pairs = pairs[:, part[pairs[0]] != part[pairs[1]]]
+    on = _overlap_in_plane(corners[pairs[1]], corners[pairs[0]])
+    doubled[pairs[:, on]] = True
     return doubled
 
 

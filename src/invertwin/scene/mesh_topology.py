@@ -10,7 +10,7 @@ diagonal of 1, and groups stand side by side (``separate_groups``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import NamedTuple, TypeAlias
 
@@ -32,6 +32,7 @@ Numbers: TypeAlias = Int64[np.ndarray, " n"]
 Groups: TypeAlias = Int64[np.ndarray, " v"]
 Owner: TypeAlias = Int64[np.ndarray, " f"] | int  # object of each triangle
 _LINE = 0.8191, 0.4731, 0.3244  # normal to no plane that is usual in models
+_BLOCK = 1 << 13  # rows
 _MAX_PARTS = 2000  # whose boxes are compared in pairs
 _SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MAX_CRACK_SHARE = 1e-3  # of the edges on both sides: width of the widest cracks that are closed
@@ -83,9 +84,8 @@ def close_cracks(
     whole, onto, open_edges, width = _whole_edges(welded, places, owner), first[:, None], 0, 0.0
     is_open = bool((whole.counts == 1).any())
     edges = _split_at_vertices(whole, places, is_open)
-    offset = places.take(first, 0)
-    offset -= places
-    moves, along = np.einsum("vi,vi->v", offset, offset) > _MAX_OFFSET**2, places[:, 0] * 0
+    square = _by_blocks(lambda rows: ((places[rows] - places[first[rows]]) ** 2).sum(1), len(first))
+    moves, along = square > _MAX_OFFSET**2, places[:, 0] * 0
     if (edges.counts == 1).any():
         onto, along, open_edges, width = _find_cracks(edges, places)
         onto, along = onto[first], along[first]
@@ -310,7 +310,7 @@ def find_edges(faces: Faces, places: Points, owner: Owner = 0) -> MeshEdges:
 
 def _whole_edges(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
     """Find the edges of triangles; vertices that lie on a side do not divide it."""
-    whole = _sides_of(faces, np.flatnonzero(~find_slivers(places.take(faces, 0))), len(places))
+    whole = _sides_of(faces, np.flatnonzero(~find_slivers(faces, places)), len(places))
     # A repeated triangle has two half edges of one apex at its edges.
     if whole.counts.max(initial=0) > 2 or (np.diff(_pairs_at_edges(whole, whole.apex)) == 0).any():
         whole = _sides_of(faces, find_distinct_faces(faces, places, owner), len(places))
@@ -324,6 +324,12 @@ def _sides_of(faces: Faces, number: Numbers, vertex_count: int) -> MeshEdges:
     return _group_sides(triangle_sides(used), apex, np.tile(number, 3), vertex_count)
 
 
+def _by_blocks(function: Callable[[slice], np.ndarray], count: int) -> np.ndarray:
+    """Join results of blocks of rows, small enough for the processor's cache."""
+    starts = range(0, max(count, 1), _BLOCK)
+    return np.concatenate([function(slice(start, start + _BLOCK)) for start in starts])
+
+
 def find_distinct_faces(faces: Faces, places: Points, owner: Owner = 0) -> Numbers:
     """Return the numbers of triangles that are neither slivers nor repetitions in one object.
 
@@ -332,7 +338,7 @@ def find_distinct_faces(faces: Faces, places: Points, owner: Owner = 0) -> Numbe
         places: positions in units of the size of their group.
         owner: object of each triangle.
     """
-    number = np.flatnonzero(~find_slivers(places.take(faces, 0)))
+    number = np.flatnonzero(~find_slivers(faces, places))
     a, b, c = faces[number].T
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     body = np.broadcast_to(owner, len(faces))[number]
@@ -397,19 +403,23 @@ def _group_sides(
     return MeshEdges(ends, counts, apex.take(order), triangle.take(order))
 
 
-def find_slivers(corners: Float64[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
+def find_slivers(faces: Faces, places: Points) -> Bool[np.ndarray, " f"]:
     """Mask of triangles that are narrower than the tolerance.
 
     Args:
-        corners: in units of the size of their group.
+        faces: vertices of each triangle.
+        places: positions in units of the size of their group.
     """
-    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    square, across, common = (
-        np.einsum("fi,fi->f", *pair) for pair in ((one, one), (other, other), (one, other))
-    )
-    longest = np.maximum(np.maximum(square, across), square + across - 2 * common)
-    # |a × b|² = a² b² − (a · b)², whose rounding is far below the square of the tolerance.
-    return square * across - common**2 <= WELD_TOLERANCE**2 * longest
+
+    def are_slivers(rows: slice) -> Bool[np.ndarray, " block"]:
+        a, b, c = np.moveaxis(places.take(faces[rows], 0), 1, 0)
+        one, other = b - a, c - a
+        square, across, common = (np.vecdot(*p) for p in ((one, one), (other, other), (one, other)))
+        longest = np.maximum(np.maximum(square, across), square + across - 2 * common)
+        # |a × b|² = a² b² − (a · b)², whose rounding is far below the square of the tolerance.
+        return square * across - common**2 <= WELD_TOLERANCE**2 * longest
+
+    return _by_blocks(are_slivers, len(faces))
 
 
 def _split_at_vertices(edges: MeshEdges, places: Points, before_cracks: bool = False) -> MeshEdges:
@@ -441,12 +451,8 @@ def _split_at_vertices(edges: MeshEdges, places: Points, before_cracks: bool = F
     row, vertex = row[order], vertex[order]
     pieces = np.bincount(rows[row], minlength=len(edges.ends)) + 1
     # Stations along each edge, one edge after the other: an end, the vertices on it, the other end.
+    stations = np.insert(edges.ends.ravel(), 2 * rows[row] + 1, vertex)
     first = np.cumsum(pieces + 1) - (pieces + 1)
-    stations = np.empty(int((pieces + 1).sum()), dtype=np.int64)
-    stations[first], stations[first + pieces] = edges.ends.T
-    inner = np.ones(len(stations), dtype=bool)
-    inner[first] = inner[first + pieces] = False
-    stations[inner] = vertex
     group = np.repeat(np.arange(len(pieces)), edges.counts)
     count = pieces[group]
     piece = np.repeat(np.arange(len(group)), count)
