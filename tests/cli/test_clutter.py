@@ -114,3 +114,21 @@ def test_without_clutter_on_request(tmp_path, monkeypatch, capsys):
     found = read_metrics(tmp_path / "out")
     assert found["position_error_m"] > 0.1
     assert "clutter" not in found
+
+
+@pytest.mark.slow
+def test_a_run_interrupted_while_it_writes_goes_on(tmp_path, monkeypatch, capsys):
+    short = RUN.replace("steps = 10", "steps = 2").replace("samples = 30_000", "samples = 3000")
+    (tmp_path / "run.toml").write_text(short + 'clutter = "always"\n')
+    run = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("invertwin.cli.commands.reconstruct.write_report", interrupt)
+        assert call(patch, *run) != 0
+    capsys.readouterr()
+    # The copy of the best fit's checkpoint is of another fit than the first one.
+    assert call(monkeypatch, *run, "--resume") == 0, capsys.readouterr().err
+    assert read_metrics(tmp_path / "out")["clutter"]["kept"]

@@ -141,8 +141,7 @@ def _write(
     save_mesh(folder.file("twin.ply"), twin)
     if run.measures is not None:
         save_mesh(folder.file("twin.glb"), twin)
-    if best["checkpoint"] != CHECKPOINT:
-        shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
+    shutil.copyfile(folder.file(best["checkpoint"]), folder.file(CHECKPOINT))
     title, status = run.title or problem.kind.title, summary.outcome
     tables = write_report(folder, metrics, title, status, parts, again="reconstruct", note=run.note)
     return tables, status
@@ -161,7 +160,7 @@ def _fit_one(run: RunFile, method: str, number: int, folder: RunFolder) -> None:
     problem = _load_problem(to_minimal_toml(run))
     problem = problem.kind.prepare(problem, folder, QUIET_CONSOLE)
     own = problem.kind.with_recording_of_start(problem, number, QUIET_CONSOLE)
-    run_fit(own, problem.starts(method)[number], number, method, folder, QUIET_CONSOLE, None)
+    run_fit(own, problem.starts(method)[number], number, method, folder, QUIET_CONSOLE)
 
 
 @lru_cache(maxsize=1)

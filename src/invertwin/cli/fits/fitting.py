@@ -40,7 +40,7 @@ from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.scene import displace
 from invertwin.seeds import derive_seed
 from invertwin.storage.folders import PARTS
-from invertwin.storage.run_folder import CHECKPOINT, RunFolder
+from invertwin.storage.run_folder import RunFolder
 from invertwin.viewer import DisplayStep
 
 _MIN_RELATIVE_PEAK = 0.1  # of the echo where a fit ends: a weaker one was not meant
@@ -60,15 +60,13 @@ def fit_all(
         console: Shows progress.
         show: Is told of steps as they come.
     """
-    work = problem.work
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
     outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
-    for method, number in work:
+    for method, number in problem.work:
         own = problem.kind.with_recording_of_start(problem, number, console)
-        checkpoint = CHECKPOINT if len(work) == 1 else None
         told = None if show is None else partial(show, own)
         start = problem.starts(method)[number]
-        row, outcome = run_fit(own, start, number, method, folder, console, checkpoint, told)
+        row, outcome = run_fit(own, start, number, method, folder, console, told)
         rows[method].append(row)
         if method not in problem.run.variants:
             outcomes[method, number] = outcome
@@ -94,7 +92,7 @@ def _fit_from_image(fits: Fits, folder: RunFolder, console: Console) -> Fits:
         return fits
     begun = displace(start.scene[name], peak - start.scene[name].center)
     start = replace(start, scene=start.scene.replace(name, pose=begun.transform))
-    row, outcome = run_fit(problem, start, number, FROM_IMAGE, folder, console, None)
+    row, outcome = run_fit(problem, start, number, FROM_IMAGE, folder, console)
     ends = " for ".join(f"({format_place(place.tolist())}) m" for place in (peak, left))
     doubt = f"with blurred kernels the fit left the echo of the image at {ends}"
     found = replace(outcome(), doubts=(doubt,))
@@ -135,7 +133,7 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     if wanted == "auto" and not discovery.needs_clutter(fits.found):
         return fits
     try:
-        row, outcome = run_fit(problem, fits.start, number, AMONG_CLUTTER, folder, console, None)
+        row, outcome = run_fit(problem, fits.start, number, AMONG_CLUTTER, folder, console)
     except InputError as error:
         if wanted == "always":
             raise
@@ -162,7 +160,6 @@ def run_fit(
     method: str,
     folder: RunFolder,
     console: Console,
-    checkpoint: str | None,
     show: Callable[[Fit, DisplayStep], None] | None = None,
 ) -> tuple[Row, Callable[[], inversion.Reconstruction]]:
     """Make one fit, or read what an interrupted run has kept of it.
@@ -174,14 +171,14 @@ def run_fit(
         mode: The run's own way to fit, a variant, or one of the data.
         folder: Keeps results and checkpoints.
         console: Shows progress.
-        checkpoint: Name of the checkpoint; None = one among the parts.
         show: Is told of steps as they come.
 
     Returns:
         The row of the fit, and a function that gives its outcome.
     """
     part = fit_file_stem(method, index)
-    checkpoint = checkpoint or f"{part}.pt"
+    # Among the parts: a later fit's outcome does not take its place.
+    checkpoint = f"{part}.pt"
     own = problem.kind.with_method(problem, method)
     stages = make_schedule(own)
     again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show, method)
