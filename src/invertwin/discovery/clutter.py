@@ -1,7 +1,7 @@
 """Fits in clutter: objects that the scene lacks are imaged, and count as background."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,15 +15,16 @@ from invertwin.discovery.imaging.reflectivity import compute_response, reconstru
 from invertwin.discovery.recordings import image_points
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
-from invertwin.inversion.observation import Unknowns, name_unknowns
+from invertwin.inversion.observation import Unknown, Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models.radar import SurrogateMap
 from invertwin.models.whitened import WhitenedMap
-from invertwin.scene import Mesh, Scene, signed_distance
+from invertwin.scene import Material, MaterialValues, Mesh, Object, Scene, signed_distance
 
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
 # as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
+_SIGNIFICANT = 3.0  # standard deviations of a permittivity from the stated one
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
 
@@ -42,34 +43,34 @@ def reconstruct_among_clutter(
 
     Echoes that the scene does not explain count as background, except around the objects that are
     fitted, see ``estimate_clutter``. A second fit, without blur, starts from the result of the
-    first, with the clutter about it.
+    first, with the clutter about it. Where the result is inconsistent with the data, and the scene
+    has objects that are not fitted, both fits are made again with the permittivities of the fitted
+    ones free: an object that is too bright would turn its faces away.
 
     Args:
         scene: initial scene.
         observations: recordings of one or several radars, each with a ``SurrogateMap``.
         parameters: modules Scene → Scene, as for ``reconstruct``.
-        schedule: schedule of each of the two fits, or its stages; all frames in every step.
+        schedule: schedule of each fit, or its stages; all frames in every step.
         seed: seed of all random numbers.
-        callbacks: observers of each of the two fits, given its number.
+        callbacks: observers of each fit, given its number: 0 and 1, 2 and 3 with permittivities.
         always: False = only if a fit without clutter is inconsistent with the data; the better of
             the two results is returned, see ``choose_result``.
         options: further options of ``reconstruct``.
 
     Raises:
-        InputError: As ``reconstruct``; another model; random frames; new modules in a later stage;
-            no object that moves.
+        InputError: as ``reconstruct``; another model; random frames; new modules in a stage; no
+            object that moves.
     """
-    is_single = isinstance(observations, inversion.Observation)
-    given = [observations] if is_single else list(observations)
+    given = list(observations) if isinstance(observations, Sequence) else [observations]
     unknowns, plain = name_unknowns(parameters), None
     if not always:
-        plain = inversion.reconstruct(
-            scene, given, copy.deepcopy(unknowns), schedule=schedule, seed=seed, **options
-        )
+        own = copy.deepcopy(unknowns)
+        plain = inversion.reconstruct(scene, given, own, schedule=schedule, seed=seed, **options)
         if not needs_clutter(plain):
             return plain
-    own = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
-    stages = make_stages(schedule, [*unknowns, *(name for found in own for name in found)])
+    sensors = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
+    stages = make_stages(schedule, [*unknowns, *(name for own in sensors for name in own)])
     if any(stage.frames_per_step is not None or stage.rebuilds_modules for stage in stages):
         raise InputError(
             "expected all frames and the same parameters in every step, got frames_per_step or a "
@@ -83,38 +84,63 @@ def reconstruct_among_clutter(
             "expected a parameter that moves an object, got none: clutter is what is away from the "
             "fitted objects; give a Pose or a shape, or use reconstruct"
         )
-    for number, blur in ((0, 1.0), (1, 0.0)):
-        blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
-        clutter = [estimate_clutter(present, o, fitted, seed=seed).background for o in blurred]
-        whitened = _whiten([o.model for o in blurred], clutter)
-        watched = [replace(o, model=model) for o, model in zip(given, whitened, strict=True)]
-        models = [_whiten([m.scale_blur(blur) for m in stage.models], clutter) for stage in stages]
-        schedule = [replace(stage, models=m) for stage, m in zip(stages, models, strict=True)]
-        how: Any = {"schedule": schedule, "seed": seed, "callbacks": callbacks(number), **options}
-        found = inversion.reconstruct(scene, watched, unknowns, **how)
-        present, modules = found.scene, list(found.parameters)
-        unknowns = {
-            name: replace(unknown, module=modules.pop(0)) for name, unknown in unknowns.items()
-        }
-    found = replace(found, doubts=_find_rivals(present, given, fitted, seed))
+
+    def fit_rounds(unknowns: dict[str, Unknown], first: int) -> inversion.Reconstruction:
+        """Fit among clutter about the start, and again, without blur, about the end."""
+        about = present
+        for number, blur in ((first, 1.0), (first + 1, 0.0)):
+            blurred = [replace(o, model=o.model.scale_blur(blur)) for o in given]
+            clutter = [estimate_clutter(about, o, fitted, seed=seed).background for o in blurred]
+            whitened = _whiten([o.model for o in blurred], clutter)
+            watched = [replace(o, model=model) for o, model in zip(given, whitened, strict=True)]
+            models = [_whiten([m.scale_blur(blur) for m in s.models], clutter) for s in stages]
+            plan = [replace(stage, models=m) for stage, m in zip(stages, models, strict=True)]
+            how: Any = {"schedule": plan, "seed": seed, "callbacks": callbacks(number), **options}
+            found = inversion.reconstruct(scene, watched, unknowns, **how)
+            about, modules = found.scene, list(found.parameters)
+            unknowns = {n: replace(own, module=modules.pop(0)) for n, own in unknowns.items()}
+        return found
+
+    again, found = copy.deepcopy(unknowns), fit_rounds(unknowns, 0)
+    if needs_clutter(found) and len(fitted) < len(objects):  # others determine the gain
+        free = _free_permittivities({name: objects[name].material for name in fitted})
+        bright = fit_rounds(again | free, 2) if free else found
+        if any(_has_moved(bright, key, objects) for key in free):
+            found = choose_result(found, bright)
+    found = replace(found, doubts=tuple(_find_rivals(found.scene, given, fitted, seed)))
     return found if plain is None else choose_result(plain, found)
+
+
+def _free_permittivities(materials: Mapping[str, Material]) -> dict[str, Unknown]:
+    """Permittivities that are plain numbers, as unknowns."""
+    found = {name: vars(item).get("permittivity") for name, item in materials.items()}
+    own = {n: value for n, value in found.items() if isinstance(value, float) and value > 1}
+    return {f"{n}.permittivity": Unknown(MaterialValues(n, permittivity=e)) for n, e in own.items()}
+
+
+def _has_moved(found: inversion.Reconstruction, key: str, before: Mapping[str, Object]) -> bool:
+    """Test whether a fitted permittivity differs significantly from the stated one.
+
+    A value that the data do not determine would only take up clutter.
+    """
+    name = key.removesuffix(".permittivity")
+    ends = (vars(objects[name].material)["permittivity"] for objects in (found.scene, before))
+    return bool(abs(next(ends) - next(ends)) > _SIGNIFICANT * found.uncertainty.deviations[key])
 
 
 def _find_rivals(
     scene: Scene, observations: Sequence[inversion.Observation], fitted: Sequence[str], seed: int
-) -> tuple[str, ...]:
+) -> Iterator[str]:
     """State where clutter is so bright that it may be echoes of the fitted objects."""
-    found = []
     for observation in observations:
         clutter = estimate_clutter(scene, observation, fitted, seed=seed)
         share = float(clutter.echoes.sum()) / _predict_power_of(fitted, scene, observation, seed)
         if share > _RIVAL_SHARE:
             place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
-            found.append(
+            yield (
                 f"echoes that the scene does not explain have {min(share, 999.0):.2g} times the "
                 f"power of the fitted objects, strongest at ({place}) m: they may be parts of these"
             )
-    return tuple(found)
 
 
 def _predict_power_of(
@@ -143,7 +169,7 @@ def needs_clutter(found: inversion.Reconstruction) -> bool:
 def choose_result(
     plain: inversion.Reconstruction, among: inversion.Reconstruction
 ) -> inversion.Reconstruction:
-    """Choose the better of two fits of the same parameters, without and among clutter.
+    """Choose the better of two fits of the same data, without and among clutter.
 
     That is the second one where the data do not speak against it, else the one with the lower loss
     with clutter.
@@ -156,8 +182,9 @@ def choose_result(
         return among
     fit, losses = among.result.fit.copy(), []
     with torch.no_grad():
-        for found in (plain, among):
-            fit.modules.load_state_dict(found.parameters.state_dict())
+        for own in (plain.result.fit, among.result.fit):
+            fit.scene, fit.unknowns = own.scene, own.unknowns
+            fit.sensor_unknowns = own.sensor_unknowns
             losses.append(float(fit.objective(fit.unblurred_maps(0))))
     return among if losses[1] <= losses[0] else plain
 

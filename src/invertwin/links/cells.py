@@ -134,11 +134,9 @@ class Cells(ReceiverLocations):
             )
         points = self.sample_points(np.random.default_rng(np.random.SeedSequence([seed, 1])))
         if propagation.edges:
-            gain, moments = propagation.gains_and_moments(scene, sensor, points.flatten(0, 1), seed)
-            shape = (len(gain), *self.shape)
-            mean = moments.unflatten(1, points.shape[:2]).mean(2)
-            gain = gain.unflatten(1, points.shape[:2]).mean(2)
-            spread = delay_spread_from_moments(mean)
+            both = propagation.gains_and_moments(scene, sensor, points.flatten(0, 1), seed)
+            gain, mean = (part.unflatten(1, points.shape[:2]).mean(2) for part in both)
+            shape, spread = (len(gain), *self.shape), delay_spread_from_moments(mean)
             return LinkStatistics(gain.reshape(shape), spread.reshape(shape))
 
         def measure(paths: RayPaths, tx: Tensor, rx: Tensor) -> Tensor:
@@ -157,8 +155,7 @@ class Cells(ReceiverLocations):
             mean = mean.flatten(0, 1).index_add(0, row, density).view(mean.shape)
         aside = propagation.panel_and_rough_moments(scene, sensor, points.flatten(0, 1), seed)
         mean = mean + aside.unflatten(1, points.shape[:2]).mean(2)
-        shape = (len(mean), *self.shape)
-        spread = delay_spread_from_moments(mean)
+        shape, spread = (len(mean), *self.shape), delay_spread_from_moments(mean)
         return LinkStatistics(mean[..., 0].reshape(shape), spread.reshape(shape))
 
 

@@ -142,8 +142,7 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     among = outcome()
     kept = wanted == "always" or discovery.choose_result(fits.found, among) is among
     observation = make_observations(problem, fits.start)[0]
-    fitted, there = dict.fromkeys(problem.run.fitted_objects), among.scene.names
-    moved = [name for name in fitted if name in there]
+    moved = [n for n in dict.fromkeys(problem.run.fitted_objects) if n in among.scene.names]
     clutter = discovery.estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
     share = float(clutter.echoes.sum() / observation.observed_map().sum())
     summary = {"kept": kept, "share": share, "strongest_m": clutter.strongest_position.tolist()}
@@ -188,7 +187,7 @@ def run_fit(
         return row, lambda: again()[0]
     begin = time.perf_counter()
     name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
-    steps = sum(stage.steps for stage in stages) * (2 if method == AMONG_CLUTTER else 1)
+    steps = sum(stage.steps for stage in stages) * (4 if method == AMONG_CLUTTER else 1)
     with inversion.report_progress(name, steps, console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
@@ -251,17 +250,16 @@ def _fit_or_search(
         sharp = [replace(o, model=o.model.scale_blur(0.0)) for o in given[1]]
         unknowns = {name: replace(unknown, rate=None) for name, unknown in given[2].items()}
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
-        return inversion.reconstruct(
-            start.scene, sharp, unknowns, callbacks=callbacks(checkpoint), **how
-        ), {}
+        how["callbacks"] = callbacks(checkpoint)
+        return inversion.reconstruct(start.scene, sharp, unknowns, **how), {}
     if method == AMONG_CLUTTER:
         # Every frame has clutter of its own.
         how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]
         part = f"{PARTS}/{Path(checkpoint).stem}_round"
-        found = discovery.reconstruct_among_clutter(
-            *given, callbacks=lambda n: callbacks(f"{part}{n}.pt"), **how
-        )
-        return found, {"checkpoint": f"{part}1.pt"}
+        how["callbacks"] = lambda n: callbacks(f"{part}{n}.pt")
+        found = discovery.reconstruct_among_clutter(*given, **how)
+        last = f"{part}{1 if len(found.parameters) == len(given[2]) else 3}.pt"
+        return found, {"checkpoint": last}
     if run.search is None:
         return inversion.reconstruct(*given, callbacks=callbacks(checkpoint), **how), {}
     part = f"{PARTS}/{Path(checkpoint).stem}_fit"
@@ -273,9 +271,8 @@ def _fit_or_search(
 
 def _make_checkpoint(problem: Problem, folder: RunFolder, name: str) -> inversion.Checkpoint:
     """Goes on from its own unfinished part; open_run has settled what may be there."""
-    return inversion.Checkpoint(
-        folder.file(name), problem.run.fit_settings.checkpoint_every, resume=True
-    )
+    every = problem.run.fit_settings.checkpoint_every
+    return inversion.Checkpoint(folder.file(name), every, resume=True)
 
 
 def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> Problem:

@@ -138,7 +138,7 @@ def parameter_values(fits: Fits) -> dict[str, list[Any]]:
         # An angle that stays where the run file has it is no unknown.
         rows = [*rows, *(row for row in angles if not math.isclose(*row[1:3], abs_tol=1e-9))]
         for coordinate, *row in rows:
-            found = [_round_zero(float(value)) for value in row]
+            found = [round(float(value), 9) + 0.0 for value in row]  # + 0.0: no negative zeros
             values[f"{name}.{coordinate}"] = found + [None] * (3 - len(found))
     for name, value in fits.best.get("values", {}).items():
         if name.split(".")[-1] == "position" and isinstance(value, list):
@@ -312,8 +312,3 @@ def _success_limits(run: RunFile, metrics: dict[str, Any]) -> str:
 def _format_status(key: str, value: Any, uninformative: bool = False) -> Any:
     """Cell of a number; a start that is lost says so, however it ended."""
     return load_texts("ends")["lost" if uninformative else value] if key == "status" else value
-
-
-def _round_zero(value: float) -> float:
-    """Without what rounding leaves of a zero."""
-    return round(value, 9) + 0.0
