@@ -89,7 +89,7 @@ class Aperture:
             cosines: direction cosines u.
             positions: positions y of the elements [m].
         """
-        phase = 2 * math.pi / self.wavelength * cosines[:, None] * positions[None]
+        phase = 2 * math.pi / self.wavelength * cosines[:, None] * positions.to(cosines.device)
         return torch.polar(torch.ones_like(phase), phase)
 
     def beams(

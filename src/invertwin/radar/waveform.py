@@ -103,8 +103,9 @@ class SampledWaveform(Waveform):
             distance: distance d from the target's range [m].
             window: taper w of the samples.
         """
-        weight = unit_window(window, self.samples).to(torch.complex128)
-        cycles = distance[:, None] / self.max_range * torch.arange(self.samples)
+        weight = unit_window(window, self.samples).to(distance.device, torch.complex128)
+        number = torch.arange(self.samples, device=distance.device)
+        cycles = distance[:, None] / self.max_range * number
         return (torch.exp(2j * math.pi * cycles) @ weight).abs().square()
 
 

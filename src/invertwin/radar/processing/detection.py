@@ -83,8 +83,8 @@ def cell_averaging_cfar(
     _check_rates(false_alarm, looks)
     mean = torch.where(torch.isfinite(band), band, 0.0).sum(-1) / count
     numbers, index = count.unique(return_inverse=True)
-    factors = f.isf(false_alarm, 2 * looks, 2 * looks * numbers.numpy())
-    return power > (torch.from_numpy(factors)[index] * mean).to(power.device)
+    factors = f.isf(false_alarm, 2 * looks, 2 * looks * numbers.cpu().numpy())
+    return power > torch.from_numpy(factors).to(mean)[index] * mean
 
 
 def ordered_statistics_cfar(
@@ -119,7 +119,7 @@ def ordered_statistics_cfar(
     level = band.sort(-1).values.take_along_dim((places - 1)[index][..., None], -1)[..., 0]
     pairs = zip(numbers.tolist(), places.tolist(), strict=True)
     factors = [_ordered_factor(n, place, false_alarm, looks) for n, place in pairs]
-    return power > (torch.tensor(factors).double()[index] * level).to(power.device)
+    return power > torch.tensor(factors).to(level)[index] * level
 
 
 def point_cloud(
@@ -259,7 +259,7 @@ def _training_cells(
 ) -> tuple[Float64[Tensor, "*batch first second cell"], Int64[Tensor, "*batch first second"]]:
     """Return the power of each cell's training cells, infinite beyond the map, and their number."""
     _refuse_gradients(power, name)
-    values = power.to("cpu", torch.float64)
+    values = power.to(torch.float64)
     if not (torch.isfinite(values).all() and (values >= 0).all()):
         raise InputError(
             "expected finite powers of at least 0, got others; pass the power, not the signal or dB"
@@ -274,7 +274,8 @@ def _training_cells(
     beside = (reach[1], reach[1], reach[0], reach[0])
     around = torch.nn.functional.pad(values, beside, value=math.inf)
     around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
-    offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
+    numbers = [torch.arange(size, device=power.device) for size in sizes]
+    offsets = [(number - r).abs() for number, r in zip(numbers, reach, strict=True)]
     cells = around[..., (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])]
     count = torch.isfinite(cells).sum(-1)
     if int(count.min()) < 1:

@@ -129,10 +129,11 @@ def compensate_tdm(
     what = f"a spectrum (frame, velocity, tx, rx, range) of {radar.shape[1]} transmitters"
     check_shape(spectrum, expected, what, "use the radar that recorded it")
     frames, count, transmitters, _, ranges = spectrum.shape
-    folds = torch.as_tensor(fold).cpu().expand(frames, count, ranges).to(torch.float64)
-    rate = velocity_axis(radar, chirps, count)[:, None] + folds * velocity_span(radar, chirps)
-    frequency = 2 / radar.waveform.wavelength * rate
-    cycles = frequency[:, :, None, :] * chirps.times(transmitters)[0][:, None]
+    folds = torch.as_tensor(fold, dtype=torch.float64, device=spectrum.device)
+    axis, starts = velocity_axis(radar, chirps, count), chirps.times(transmitters)[0]
+    rate = folds.expand(frames, count, ranges) * velocity_span(radar, chirps)
+    frequency = 2 / radar.waveform.wavelength * (rate + axis[:, None].to(rate))
+    cycles = frequency[:, :, None, :] * starts[:, None].to(rate)
     turn = torch.exp(-2j * math.pi * (cycles - cycles.round()))
     return spectrum * turn[:, :, :, None].to(spectrum)
 
@@ -258,7 +259,8 @@ def micro_doppler(
     starts = torch.arange(power.shape[-2], dtype=torch.float64) * step
     loop = 0.5 * radar.waveform.wavelength / velocity_span(radar, chirps)
     times = (starts + 0.5 * (length - 1)) * loop
-    return Spectrogram(power, times, velocity_axis(radar, chirps, length))
+    axes = times.to(power.device), velocity_axis(radar, chirps, length).to(power.device)
+    return Spectrogram(power, *axes)
 
 
 def _steer_beams(

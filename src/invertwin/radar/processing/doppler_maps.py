@@ -120,7 +120,7 @@ def doppler_maps(
     movers, mover = None, None
     if bool(cells.any()):
         movers, mover = _sum_range_rates(moving, power, radar, grid, chirps, cells)
-    velocities = doppler.velocity_axis(radar, chirps)
+    velocities = doppler.velocity_axis(radar, chirps).to(flat.device)
     return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
 
 
@@ -140,8 +140,8 @@ def _sum_range_rates(
     cube = doppler.compensate_tdm(cube, radar, chirps, doppler.interpolate_rates(level))[0]
     velocities = doppler.velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
-    total = torch.zeros(grid.shape, dtype=torch.float64)
-    seen = (grid.u[:, None].square() + grid.v.square()) <= 1
+    total = level.new_zeros(grid.shape, dtype=torch.float64)
+    seen = ((grid.u[:, None].square() + grid.v.square()) <= 1).to(level.device)
     peaks: list[Peak] = []
     for rows in track(torch.arange(chirps.count).split(chunk), "range rates"):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
@@ -156,10 +156,10 @@ def _detect_moving_cells(moving: _RangeDoppler, flat: _RangeDoppler, looks: int)
     """Detect cells above noise and drift."""
     moving, middle = moving.double(), len(flat) // 2
     rows = [noise_power(row, looks) for row in moving.T] if len(flat) >= _OWN_NOISE else [0.0]
-    level = torch.tensor(rows, dtype=torch.float64).clamp_min(noise_power(moving, looks))
+    level = moving.new_tensor(rows).clamp_min(noise_power(moving, looks))
     factor = float(gammainccinv(looks, _FALSE_ALARM_RATE / moving.numel())) / looks
     least = (factor * level).clamp_min(_ROUNDING * float(flat.max()))
-    slow = (torch.arange(len(flat)) - middle).abs() <= _STATIC_BINS
+    slow = (torch.arange(len(flat), device=flat.device) - middle).abs() <= _STATIC_BINS
     drift = torch.where(slow[:, None], _DRIFT_LEVEL * flat[middle].double(), 0.0)
     return (moving > least) & (moving > drift)
 
@@ -189,7 +189,7 @@ def high_resolution_map(
         power = capon(snapshots, radar, grid)[0]
     else:
         power = music(snapshots, radar, grid, sources="mdl" if sources is None else sources)[0]
-    return power * (grid.u[:, None].square() + grid.v.square() <= 1)
+    return power * (grid.u[:, None].square() + grid.v.square() <= 1).to(power.device)
 
 
 def doppler_snapshots(

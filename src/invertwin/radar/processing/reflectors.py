@@ -60,6 +60,7 @@ def detect_points(
         cube = range_profile(signal[:, 0], radar, whole)[:, None]
     else:
         cube = doppler.range_doppler(signal, radar, whole, chirps)
+    cube = cube.cpu()  # points are found one by one
     everywhere = cube[0].abs().square().double().mean((1, 2))
     flat, cube = everywhere[:, : grid.range_count], cube[..., : grid.range_count]
     if chirps is not None:
@@ -90,10 +91,10 @@ def detect_points(
 def format_points_csv(points: detection.PointCloud) -> str:
     """Return one line per point, the strongest first."""
     lines = ["range_m,velocity_m_s,u,v,power_db,x_m,y_m,z_m"]
-    for i in points.power.argsort(descending=True).tolist():
-        level = 10 * math.log10(float(points.power[i]))
-        values = [points.range[i], points.velocity[i], points.u[i], points.v[i], level]
-        lines.append(",".join(f"{float(value):.6g}" for value in (*values, *points.position[i])))
+    levels = 10 * points.power.log10()
+    columns = points.range, points.velocity, points.u, points.v, levels, *points.position.T
+    table = torch.stack(columns, 1)[points.power.argsort(descending=True)]
+    lines += [",".join(f"{value:.6g}" for value in row) for row in table.tolist()]
     return "\n".join(lines) + "\n"
 
 

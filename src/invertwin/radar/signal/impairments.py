@@ -77,7 +77,8 @@ class PhaseNoise:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:
             points = np.log10(np.asarray(self.offsets))
-            level = torch.from_numpy(np.interp(np.log10(offset.numpy()), points, self.levels))
+            places = np.log10(offset.cpu().numpy())
+            level = torch.from_numpy(np.interp(places, points, self.levels)).to(offset)
         return 2 * 10 ** (level / 10)
 
 

@@ -53,7 +53,7 @@ def interpolate_response(
     step = cell / _TABLE
     distance = offsets.abs() / step
     last = int(distance.detach().max()) + 3 if distance.numel() else 3
-    table = response(torch.arange(-1, last + 1, dtype=torch.float64) * step)
+    table = response(torch.arange(-1, last + 1, dtype=torch.float64, device=offsets.device) * step)
     index = distance.detach().floor().to(torch.int64)
     before, here, after, beyond = (table[index + k] for k in range(4))
     t = distance - index
@@ -112,7 +112,7 @@ def paired_array_spread(array: Aperture, du: _Values, dv: _Values) -> _Values:
         dv: offset in v of each point.
     """
     along, up = array.steering(du, array.y), array.steering(dv, array.z)
-    response = ((along @ _array_weights(array)) * up).sum(1)
+    response = ((along @ _array_weights(array).to(along)) * up).sum(1)
     return response.real.square() + response.imag.square()
 
 
