@@ -47,6 +47,7 @@ LISTED = {
     "radar/processing/detection.py:point_cloud": "SciPy's filter of maxima",
     "radar/processing/reflectors.py:detect_points": "points are found one by one",
     "radar/processing/reflectors.py:format_points_csv": "text",
+    "links/listing.py:path_table": "text",
 }
 _KEY = torch._C.DispatchKey  # pyright: ignore[reportAttributeAccessIssue]
 aten = torch.ops.aten
@@ -167,7 +168,8 @@ def _resolve(value: Any) -> Any:
 
 
 @cache
-def _register() -> torch.library.Library:
+def register() -> torch.library.Library:
+    """Make `DEVICE` known to torch: before the first derivative of the process."""
     _setup_privateuseone_for_python_backend(DEVICE)
     library = torch.library.Library("aten", "IMPL")
 
@@ -187,7 +189,7 @@ def _register() -> torch.library.Library:
 @contextmanager
 def fake_cuda() -> Iterator[Moves]:
     """Run operations of torch as where there is a GPU; yields what was moved to the CPU."""
-    _register()
+    register()
     moves = Moves()
     with _Mode(moves):
         yield moves

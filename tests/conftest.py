@@ -92,6 +92,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "data_folder" in getattr(item, "fixturenames", ()):
             item.add_marker("data")
+    if any(item.get_closest_marker("fake_cuda") for item in items):
+        import claimed_tensors
+
+        claimed_tensors.register()  # before the first derivative, when autograd starts threads
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return

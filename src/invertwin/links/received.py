@@ -163,6 +163,7 @@ class PropagationSettings:
             tx_mount: Antenna mount of the transmitters.
         """
         power = path_powers(paths, tx_mount, self.receivers)
+        tx, rx = (places.to(paths.delay.device) for places in (tx, rx))
         excess = paths.delay - (rx[paths.rx] - tx[paths.tx]).norm(dim=1) / SPEED_OF_LIGHT
         return torch.stack([power, power * excess, power * excess**2], 1)
 
@@ -323,7 +324,7 @@ def _band_mean(paths: RayPaths, field: Tensor, delay: Tensor, bandwidth: float) 
     pairs = nodes > min(row.shape[1], _MAX_NODES)
     cost = row.shape[1] * (row.shape[1] if pairs else nodes) * field.shape[1] * field.shape[2]
     found = []
-    for some in torch.arange(len(row)).split(max(1, _VALUES_PER_CHUNK // cost)):
+    for some in torch.arange(len(row), device=row.device).split(max(1, _VALUES_PER_CHUNK // cost)):
         parts = torch.where(filled[some], field[row[some]], 0.0)
         late = torch.where(filled[some], delay[row[some]] - middle[some, None, None, None], 0.0)
         late = bandwidth * late
@@ -343,6 +344,7 @@ def _sum_over_pairs(field: Tensor, delay_cycles: Tensor) -> Tensor:
 
 def _mean_over_nodes(field: Tensor, delay_cycles: Tensor, count: int) -> Tensor:
     """The same as a mean of |H|² over frequencies in the band, those of Gauss's rule."""
-    places, weights = map(torch.from_numpy, _gauss_nodes(count))
+    rule = map(torch.from_numpy, _gauss_nodes(count))
+    places, weights = (part.to(field.device) for part in rule)
     total = torch.einsum("lirt,lirtn->lrtn", field, phasor(-0.5 * delay_cycles[..., None] * places))
     return 0.5 * torch.view_as_real(total).square().sum(-1) @ weights

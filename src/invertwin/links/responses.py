@@ -71,12 +71,12 @@ class AntennaMount:
         gain = self.array.pattern.gain(local)
         lit = gain > 0  # a root of zero has no derivative
         strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
-        up = torch.tensor(_UP, dtype=torch.float64)
+        up = torch.tensor(_UP, dtype=torch.float64, device=direction.device)
         own, basis = polarisations(local, up), polarisations(direction, up)
         change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)
         jones = self.array.jones
-        mixed = jones.evaluate(local).expand(len(local), -1, -1)
-        weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures, mixed)
+        mixed = jones.evaluate(local).to(change).expand(len(local), -1, -1)
+        weights = torch.einsum("pwb,ek,pkb->pew", change, jones.mixtures.to(change), mixed)
         return strength[:, None, None] * weights
 
     def element_slopes(
@@ -106,12 +106,12 @@ class AntennaMount:
         turn = self._rotations_of(index)
         # An antenna that turns back has the field of a direction that turns, in the basis here. A
         # difference works in every mode of differentiation, and for patterns that are tables.
-        generator = torch.linalg.cross(axis[:, None], _world_axes()[None])
+        generator = torch.linalg.cross(axis[:, None], _world_axes().to(axis.device)[None])
         back = torch.linalg.matrix_exp(_ROTATION_STEP * generator)
         later, earlier = (self._turned_weights(direction, by @ turn) for by in (back, back.mT))
         slope = (later - earlier) / (2 * _ROTATION_STEP)
         change = (zone[:, None, None] * torch.view_as_real(slope).flatten(2)).square().sum(2)
-        peak = self.array.pattern.table().max().clamp_min(1e-300)
+        peak = self.array.pattern.table().max().clamp_min(1e-300).to(change.device)
         slope = slope * (peak / torch.maximum(change, peak))[..., None]
         moved = torch.linalg.cross(axis, direction)
         ahead = 1j * wave_number * self.element_advances(moved, index)[..., None]
@@ -126,18 +126,20 @@ class AntennaMount:
             direction: Unit vectors in the world, away from the terminal.
             index: Its number.
         """
-        offsets = torch.einsum("pij,ej->pei", self._rotations_of(index), self.array.positions)
+        places = self.array.positions.to(direction.device)
+        offsets = torch.einsum("pij,ej->pei", self._rotations_of(index), places)
         return torch.einsum("pei,pi->pe", offsets, direction)
 
     def _rotations_of(self, index: Tensor) -> Tensor:
-        if self.rotations.ndim == 2:
-            return self.rotations.expand(len(index), 3, 3)
+        rotations = self.rotations.to(index.device)
+        if rotations.ndim == 2:
+            return rotations.expand(len(index), 3, 3)
         if len(index) and int(index.max()) >= len(self.rotations):
             raise InputError(
                 f"expected a rotation for each of {int(index.max()) + 1} places or more, got "
                 f"{len(self.rotations)}; give one for all, or one for each"
             )
-        return self.rotations[index]
+        return rotations[index]
 
 
 _DEFAULT = AntennaMount()
@@ -285,7 +287,7 @@ def impulse_response(
     turned = amplitude * phasor(-paths.frequency * delay)
     shape = (len(paths), *amplitude.shape[1:], count)
     require_memory(16.0 * math.prod(shape), "an impulse response", "ask for fewer taps", "taps")
-    times = first + torch.arange(count, dtype=torch.float64) / band
+    times = first + torch.arange(count, dtype=torch.float64, device=delay.device) / band
     return _sum_by_link(paths, turned[..., None] * torch.sinc(band * (delay[..., None] - times)))
 
 
@@ -299,6 +301,7 @@ def _evaluate_responses(
     pairs = amplitude.shape[1] * amplitude.shape[2]
     # Delays change with time: a Doppler shift ν of the carrier f₀ is dτ/dt = −ν/f₀.
     rate = -paths.doppler / paths.frequency
+    frequencies, times = frequencies.to(delay.device), times.to(delay.device)
     parts = []
     chunk = max(1, _VALUES_PER_CHUNK // max(1, len(paths) * pairs * len(times)))
     for some in frequencies.split(chunk):

@@ -128,20 +128,22 @@ class JonesTable:
         Args:
             direction: unit vectors pointing away from the antenna [*, 3].
         """
+        tables = (table.to(direction.device) for table in (self.theta, self.phi, self.vectors))
+        theta, phi_nodes, vectors = tables
         x, y, z = direction.unbind(-1)
         # Neither the radius nor atan2 has a gradient on the axis; φ is arbitrary there.
         on_axis = (y == 0) & (z == 0)
         radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, y**2 + z**2).sqrt())
-        row, up = _locate_nodes(self.theta, torch.atan2(radius, x))
+        row, up = _locate_nodes(theta, torch.atan2(radius, x))
         phi = torch.atan2(z, torch.where(on_axis, 1.0, y))
-        around = torch.cat([self.phi, self.phi[:1] + 2 * math.pi])
-        phi = self.phi[0] + (phi - self.phi[0]) % (2 * math.pi)
+        around = torch.cat([phi_nodes, phi_nodes[:1] + 2 * math.pi])
+        phi = phi_nodes[0] + (phi - phi_nodes[0]) % (2 * math.pi)
         column, across = _locate_nodes(around, phi)
-        after = (column + 1) % len(self.phi)
-        found = torch.zeros(len(direction), 2, dtype=torch.complex128)
+        after = (column + 1) % len(phi_nodes)
+        found = vectors.new_zeros(len(direction), 2)
         for line, share in ((row, 1 - up), (row + 1, up)):
             for place, part in ((column, 1 - across), (after, across)):
-                found = found + (share * part)[:, None] * self.vectors[line, place]
+                found = found + (share * part)[:, None] * vectors[line, place]
         return found / torch.view_as_real(found).flatten(-2).norm(dim=-1).clamp_min(1e-9)[:, None]
 
 

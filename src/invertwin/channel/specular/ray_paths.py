@@ -107,10 +107,11 @@ class RayPaths(Rows):
         """
         count = torch.bincount(self.link, minlength=self.counts[0] * self.counts[1])
         order = self.link.argsort(stable=True)
-        position = torch.arange(len(self)) - (count.cumsum(0) - count)[self.link[order]]
+        number = torch.arange(len(self), device=order.device)
+        position = number - (count.cumsum(0) - count)[self.link[order]]
         shape = (len(count), int(count.max()) if len(count) else 0)
-        row = torch.zeros(shape, dtype=torch.int64)
-        filled = torch.zeros(shape, dtype=torch.bool)
+        row = order.new_zeros(shape)
+        filled = torch.zeros_like(row, dtype=torch.bool)
         row[self.link[order], position] = order
         filled[self.link[order], position] = True
         return row.unflatten(0, self.counts), filled.unflatten(0, self.counts)
@@ -118,9 +119,9 @@ class RayPaths(Rows):
     def reverse(self) -> "RayPaths":
         """Return the reciprocal paths, with transmitters and receivers exchanged."""
         depth = self.depth[:, None]
-        width = torch.arange(self.kinds.shape[1])
+        width = torch.arange(self.kinds.shape[1], device=depth.device)
         back = torch.where(width < depth, depth - 1 - width, width)
-        rows = torch.arange(len(self))[:, None]
+        rows = torch.arange(len(self), device=depth.device)[:, None]
         names = ("vertices", "kinds", "faces", "objects")
         reversed_columns = {name: getattr(self, name)[rows, back] for name in names}
         if self.slopes is not None and self.axes is not None:
@@ -176,5 +177,6 @@ def match_rows(
     many = torch.bincount(second, minlength=count)
     begin = many.cumsum(0) - many
     times = many[first]
-    row = torch.arange(len(first)).repeat_interleave(times)
-    return row, order[begin[first[row]] + (torch.arange(len(row)) - (times.cumsum(0) - times)[row])]
+    row = torch.arange(len(first), device=times.device).repeat_interleave(times)
+    number = torch.arange(len(row), device=times.device)
+    return row, order[begin[first[row]] + (number - (times.cumsum(0) - times)[row])]
