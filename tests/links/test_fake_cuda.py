@@ -4,14 +4,14 @@ from functools import cache
 
 import pytest
 import torch
-from claimed_tensors import Case, Move, check_case, public_calls
-from scenes import complex128, float64, occluder
 from torch import Tensor
 
 import invertwin.links as lk
+from claimed_tensors import Case, Move, check_case, check_on_gpu, public_calls
 from invertwin.channel import RayPaths, trace_paths
 from invertwin.scene import AntennaArray, TabulatedPattern, linear_array
 from invertwin.scene.polarisation import JonesTable
+from scenes import complex128, float64, occluder
 
 pytestmark = pytest.mark.fake_cuda
 FREQUENCY = 3.5e9
@@ -52,7 +52,9 @@ CASES: dict[str, Case] = {
         move(directions()), move(torch.zeros(2, dtype=torch.int64))
     ),
     "AntennaMount.element_slopes": lambda move: ARRAY.element_slopes(
-        *move((directions(), torch.zeros(2, dtype=torch.int64), directions().roll(1, 1))),
+        move(directions()),
+        move(torch.zeros(2, dtype=torch.int64)),
+        move(directions().roll(1, 1)),
         70.0,
         move(float64([0.1, 0.2])),
     ),
@@ -116,6 +118,12 @@ NO_CASE = {
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_is_at_home_on_both_devices(name):
     check_case(CASES[name], returns_on_cpu=name in ON_CPU)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_is_the_same_on_a_gpu(name):
+    check_on_gpu(CASES[name])
 
 
 def test_every_public_function_has_a_case_or_a_reason():

@@ -1,19 +1,19 @@
-"""Signals on a GPU: every public function of `invertwin.radar` on tensors that claim to be there."""
+"""Signals on a GPU: every public function of the radar on tensors that claim to be there."""
 
 from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
-from claimed_tensors import Case, Move, check_case, public_calls
-from scenes import float64
 from torch import Tensor
 
 import invertwin.radar as rd
+from claimed_tensors import Case, Move, check_case, check_on_gpu, public_calls
 from invertwin.channel import Paths
 from invertwin.channel.paths import make_paths
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.scene import linear_array
+from scenes import float64
 
 pytestmark = pytest.mark.fake_cuda
 HALF = 0.5 * SPEED_OF_LIGHT / 77e9
@@ -100,9 +100,8 @@ def impair(move: Move, name: str) -> Tensor:
 
 
 def shift_by(module: torch.nn.Module, move: Move, radar: rd.Radar = RADAR) -> Tensor:
-    """The signal of a radar that a module changes, and its derivative by the module."""
-    beat = rd.beat_signal(move(points(speed=0.0)), module(radar))
-    return beat
+    """The signal of a radar that a module changes."""
+    return rd.beat_signal(move(points(speed=0.0)), module(radar))
 
 
 def gradient(move: Move, function: Case) -> list[Tensor]:
@@ -119,7 +118,7 @@ def signal_gradient(move: Move) -> list[Tensor]:
     return gradient(move, lambda given: rd.beat_signal(replace(paths, coefficient=given), RADAR))
 
 
-SURROGATE = rd.SURROGATES["annealed"]
+SURROGATE = rd.Surrogate(range_width=3.0, angle_width=1.5)
 AIRY = rd.Surrogate(angle_kernel="airy")
 BIASED = replace(RADAR, range_bias=torch.tensor(0.03))
 
@@ -255,7 +254,7 @@ NO_CASE = {
     ),
     "Peak.metrics": "numbers of Python",
     "Waveform.range_response": "abstract",
-    "save_points": "writes a file: tested below",
+    "save_points": "writes a file",
     "surrogate_spectrum": "traces rays: its map is where Dr.Jit has it, see tests/channel/rays",
 }
 
@@ -263,6 +262,12 @@ NO_CASE = {
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_is_at_home_on_both_devices(name):
     check_case(CASES[name], returns_on_cpu=name in ON_CPU)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_is_the_same_on_a_gpu(name):
+    check_on_gpu(CASES[name])
 
 
 def test_every_public_function_has_a_case_or_a_reason():

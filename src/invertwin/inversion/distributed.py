@@ -44,7 +44,7 @@ def mean_over_views(
     total = torch.zeros((), dtype=torch.float64)
     for view in views[rank::count]:
         value = loss(view) / len(views)
-        total += value.detach()
+        total += value.item()
         # One graph per view: its memory is freed before the next view.
         parts = torch.autograd.grad(value, free, allow_unused=True, materialize_grads=True)
         sums = [own + part for own, part in zip(sums, parts, strict=True)]

@@ -211,7 +211,8 @@ class Fit:
             # On a core that is idle while the kernels of the prediction are compiled.
             with ThreadPoolExecutor(1) as beside:
                 blurred = beside.submit(model.blur_observed, observed, sensor)
-                pairs.append((model.predict(scene, sensor, seed), blurred.result()))
+                predicted = model.predict(scene, sensor, seed)
+                pairs.append((predicted, blurred.result().to(predicted.device)))
         return pairs
 
     def unblurred_maps(self, seed_number: int, **sampling_changes: Any) -> MapPairs:
@@ -226,7 +227,8 @@ class Fit:
         for k, (model, sensor) in enumerate(zip(self._models, sensors, strict=True)):
             key = derive_seed(self._settings.seed, _UNBLURRED_SEED_KEY, seed_number, k)
             model = model.with_sampling(**sampling_changes) if sampling_changes else model
-            pairs.append((model.scale_blur(0.0).predict(scene, sensor, key), self._observed[k]))
+            predicted = model.scale_blur(0.0).predict(scene, sensor, key)
+            pairs.append((predicted, self._observed[k].to(predicted.device)))
         return pairs
 
     def loss_at_start(self) -> float:

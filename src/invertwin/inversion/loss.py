@@ -290,7 +290,9 @@ class SpectrumLoss:
         self, levels: list[list[_PowerBlock]], gain: float, noise: float
     ) -> tuple[Tensor, Tensor]:
         """Derivatives of the negative loss and Hessian of the loss by relative gain and noise."""
-        slope, hessian = torch.zeros(2).double(), torch.zeros(2, 2).double()
+        device = levels[0][0][0].device
+        slope = torch.zeros(2, dtype=torch.float64, device=device)
+        hessian = torch.zeros(2, 2, dtype=torch.float64, device=device)
         for blocks in levels:
             count = sum(len(a) for a, *_ in blocks)
             for _, a, data in blocks:
@@ -304,8 +306,8 @@ class SpectrumLoss:
                 slope += (shares @ weighed.sub(1)).double() / count
                 hessian += (curved @ shares.T).double() / count
         scale = torch.tensor([gain, noise], dtype=torch.float64)
-        slope = slope * scale
-        return slope, hessian * scale * scale[:, None]
+        slope = slope.cpu() * scale
+        return slope, hessian.cpu() * scale * scale[:, None]
 
     def _squared_error(self, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
         gain, _ = self._fit_gain(pairs)
@@ -452,7 +454,7 @@ class CorrelationLoss:
             InputError: Maps of different shapes.
         """
         _check_shapes(simulated, measured)
-        return 1 - self._unit_row(simulated) @ self._unit_row(measured)
+        return 1 - self._unit_row(simulated) @ self._unit_row(measured.to(simulated.device))
 
     def curvature(
         self, simulated: _Bins, measured: _Bins, tangents: Float[Tensor, "p *map"]
@@ -519,12 +521,12 @@ class Objective:
             weight * loss(*pair)
             for loss, weight, pair in zip(self.losses, self.weights, maps, strict=True)
         ]
-        return torch.stack(terms).sum() / sum(self.weights)
+        return torch.stack([term.to(terms[0].device) for term in terms]).sum() / sum(self.weights)
 
     def curvature(
         self, maps: MapPairs, tangents: Sequence[Float[Tensor, "p *map"]]
     ) -> Float[Tensor, "p p"]:
-        """Compute the Gauss–Newton matrix of the weighted mean.
+        """Compute the Gauss–Newton matrix of the weighted mean, on the CPU as the parameters are.
 
         Args:
             maps: predicted and observed maps.
@@ -533,7 +535,7 @@ class Objective:
         total = torch.zeros((), dtype=torch.float64)
         for loss, weight, pair, rows in zip(self.losses, self.weights, maps, tangents, strict=True):
             assert isinstance(loss, CURVED)
-            total = total + weight * loss.curvature(*pair, rows)
+            total = total + weight * loss.curvature(*pair, rows).cpu()
         return total / sum(self.weights)
 
 

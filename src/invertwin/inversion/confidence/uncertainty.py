@@ -345,10 +345,10 @@ def _held_mean_square(slope: Tensor, noise: Tensor, score: Tensor) -> Tensor:
 
 
 def _project(loss_gradients: Sequence[Sequence[Tensor]], rows: Sequence[Tensor]) -> Tensor:
-    """Return gradients by coordinates from gradients by maps: one row for each of these."""
+    """Return gradients by coordinates, on the CPU, from gradients by maps: a row for each."""
     flat = [part.flatten(1) for part in rows]
     terms = ([f @ s.flatten() for f, s in zip(flat, own, strict=True)] for own in loss_gradients)
-    return torch.stack([torch.stack(own).sum(0) for own in terms]).double()
+    return torch.stack([torch.stack(own).sum(0) for own in terms]).double().cpu()
 
 
 def _frame_covariance(
@@ -357,7 +357,7 @@ def _frame_covariance(
     """Estimate the covariance of the gradient from the scatter of the terms of single frames."""
     total = torch.zeros((), dtype=torch.float64)
     for slope, own in zip(loss_gradients, map_derivatives, strict=True):
-        scores = torch.einsum("pfn,fn->pf", own.flatten(2), slope.flatten(1)).double()
+        scores = torch.einsum("pfn,fn->pf", own.flatten(2), slope.flatten(1)).double().cpu()
         total = total + len(slope) * torch.cov(scores).reshape(len(own), -1)
     return total
 
