@@ -290,9 +290,8 @@ class SpectrumLoss:
         self, levels: list[list[_PowerBlock]], gain: float, noise: float
     ) -> tuple[Tensor, Tensor]:
         """Derivatives of the negative loss and Hessian of the loss by relative gain and noise."""
-        device = levels[0][0][0].device
-        slope = torch.zeros(2, dtype=torch.float64, device=device)
-        hessian = torch.zeros(2, 2, dtype=torch.float64, device=device)
+        like = levels[0][0][0].new_zeros(0, dtype=torch.float64)
+        slope, hessian = like.new_zeros(2), like.new_zeros(2, 2)
         for blocks in levels:
             count = sum(len(a) for a, *_ in blocks)
             for _, a, data in blocks:

@@ -24,14 +24,9 @@ from invertwin.channel import RayPaths, Sampling, trace_paths
 from invertwin.checks import checked_number
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.links import responses
 from invertwin.links.metasurface.panel import Metasurface, panel_paths
-from invertwin.links.responses import (
-    AntennaMount,
-    frequency_response,
-    path_amplitudes,
-    phasor,
-    sum_over_paths,
-)
+from invertwin.links.responses import AntennaMount, path_amplitudes, phasor, sum_over_paths
 from invertwin.links.scattered import scattered_moments
 from invertwin.links.spreads import path_powers, safe_sqrt
 from invertwin.links.transmitters import Transmitters
@@ -244,7 +239,11 @@ class PropagationSettings:
         def evaluate_batch(batch: Tensor) -> tuple[Tensor]:
             paths = self.trace_links(scene, sensor, batch, seed)
             ends = {"tx": sensor.mount, "rx": self.receivers}
-            return (frequency_response(paths, frequencies, **ends)[:, 0, :, 0].transpose(0, 1),)
+            return (
+                responses.frequency_response(paths, frequencies, **ends)[:, 0, :, 0].transpose(
+                    0, 1
+                ),
+            )
 
         return evaluate_in_batches(evaluate_batch, positions)[0]
 
@@ -344,7 +343,6 @@ def _sum_over_pairs(field: Tensor, delay_cycles: Tensor) -> Tensor:
 
 def _mean_over_nodes(field: Tensor, delay_cycles: Tensor, count: int) -> Tensor:
     """The same as a mean of |H|² over frequencies in the band, those of Gauss's rule."""
-    rule = map(torch.from_numpy, _gauss_nodes(count))
-    places, weights = (part.to(field.device) for part in rule)
+    places, weights = (torch.from_numpy(part).to(field.device) for part in _gauss_nodes(count))
     total = torch.einsum("lirt,lirtn->lrtn", field, phasor(-0.5 * delay_cycles[..., None] * places))
     return 0.5 * torch.view_as_real(total).square().sum(-1) @ weights

@@ -127,8 +127,7 @@ class AntennaMount:
             index: Its number.
         """
         places = self.array.positions.to(direction.device)
-        offsets = torch.einsum("pij,ej->pei", self._rotations_of(index), places)
-        return torch.einsum("pei,pi->pe", offsets, direction)
+        return torch.einsum("pij,ej,pi->pe", self._rotations_of(index), places, direction)
 
     def _rotations_of(self, index: Tensor) -> Tensor:
         rotations = self.rotations.to(index.device)

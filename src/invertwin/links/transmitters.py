@@ -51,8 +51,7 @@ class Transmitters:
         Args:
             chosen: Their numbers.
         """
-        rows = torch.as_tensor(chosen)
-        terminals = self.mount
+        rows, terminals = torch.as_tensor(chosen), self.mount
         if terminals.rotations.ndim == 3:
             terminals = replace(terminals, rotations=terminals.rotations[rows])
         return Transmitters(self.positions[rows], terminals, torch.as_tensor(self.power_dbm)[rows])

@@ -104,8 +104,7 @@ class SampledWaveform(Waveform):
             window: taper w of the samples.
         """
         weight = unit_window(window, self.samples).to(distance.device, torch.complex128)
-        number = torch.arange(self.samples, device=distance.device)
-        cycles = distance[:, None] / self.max_range * number
+        cycles = distance[:, None] / self.max_range * torch.arange(self.samples).to(distance)
         return (torch.exp(2j * math.pi * cycles) @ weight).abs().square()
 
 

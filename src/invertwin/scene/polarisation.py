@@ -128,18 +128,17 @@ class JonesTable:
         Args:
             direction: unit vectors pointing away from the antenna [*, 3].
         """
-        tables = (table.to(direction.device) for table in (self.theta, self.phi, self.vectors))
-        theta, phi_nodes, vectors = tables
         x, y, z = direction.unbind(-1)
+        theta, nodes, vectors = (t.to(x.device) for t in (self.theta, self.phi, self.vectors))
         # Neither the radius nor atan2 has a gradient on the axis; φ is arbitrary there.
         on_axis = (y == 0) & (z == 0)
         radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, y**2 + z**2).sqrt())
         row, up = _locate_nodes(theta, torch.atan2(radius, x))
         phi = torch.atan2(z, torch.where(on_axis, 1.0, y))
-        around = torch.cat([phi_nodes, phi_nodes[:1] + 2 * math.pi])
-        phi = phi_nodes[0] + (phi - phi_nodes[0]) % (2 * math.pi)
+        around = torch.cat([nodes, nodes[:1] + 2 * math.pi])
+        phi = nodes[0] + (phi - nodes[0]) % (2 * math.pi)
         column, across = _locate_nodes(around, phi)
-        after = (column + 1) % len(phi_nodes)
+        after = (column + 1) % len(nodes)
         found = vectors.new_zeros(len(direction), 2)
         for line, share in ((row, 1 - up), (row + 1, up)):
             for place, part in ((column, 1 - across), (after, across)):

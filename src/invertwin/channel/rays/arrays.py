@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import backend, dr, mi, mit
 from invertwin.checks import strip_derivatives
 
 
@@ -26,7 +26,7 @@ def to_double(values: Tensor) -> mit.Float64:
 
 def to_index(values: Tensor) -> mit.UInt32:
     """Convert a torch tensor of non-negative integers to a flat Dr.Jit index array."""
-    return mi.UInt32(_copy_aligned(values, torch.int32).view(np.uint32))
+    return mi.UInt32(_copy_aligned(values, torch.int32).view(torch.uint32))
 
 
 def to_signed(values: Tensor) -> mit.Int32:
@@ -34,15 +34,16 @@ def to_signed(values: Tensor) -> mit.Int32:
     return mi.Int32(_copy_aligned(values, torch.int32))
 
 
-def _copy_aligned(values: Tensor, dtype: torch.dtype) -> np.ndarray:
+def _copy_aligned(values: Tensor, dtype: torch.dtype) -> Tensor:
     """Copy a tensor into flat memory of torch, which is aligned to 64 bytes.
 
     Dr.Jit reads such memory in place; for other alignments, as NumPy's may be, it compiles separate
-    kernels.
+    kernels. Tensors on a GPU that traces stay there.
     """
     with _DisableFuncTorch():  # within `torch.func`, even new tensors are wrapped
-        given = strip_derivatives(values).cpu()
-        return torch.empty(given.shape, dtype=dtype).copy_(given).ravel().numpy()
+        given = strip_derivatives(values)
+        device = given.device if backend() == "cuda" else torch.device("cpu")
+        return torch.empty(given.shape, dtype=dtype, device=device).copy_(given).ravel()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> mit.Float:

@@ -107,8 +107,7 @@ class RayPaths(Rows):
         """
         count = torch.bincount(self.link, minlength=self.counts[0] * self.counts[1])
         order = self.link.argsort(stable=True)
-        number = torch.arange(len(self), device=order.device)
-        position = number - (count.cumsum(0) - count)[self.link[order]]
+        position = torch.arange(len(self)).to(order) - (count.cumsum(0) - count)[self.link[order]]
         shape = (len(count), int(count.max()) if len(count) else 0)
         row = order.new_zeros(shape)
         filled = torch.zeros_like(row, dtype=torch.bool)

@@ -103,10 +103,8 @@ class FitResult:
         count = min(model.realisation_count for model in models)
         for number in track(range(count), "realisations of the twin"):
             yield [
-                look(derive_seed(number, k), noise).to(predicted.device)
-                for k, (look, noise, (predicted, _)) in enumerate(
-                    zip(looks, noises, self.maps, strict=True)
-                )
+                look(derive_seed(number, k), noise).to(pair[0].device)
+                for k, (look, noise, pair) in enumerate(zip(looks, noises, self.maps, strict=True))
             ]
 
     def loss_gradients(self, maps: MapPairs) -> tuple[float, list[Tensor]]:

@@ -384,8 +384,7 @@ def _sandwich_covariance(
     """
     values, axes = torch.linalg.eigh(curvature)
     least = _MIN_INFORMATION_FRACTION * (axes.T @ curvature_bias @ axes).diagonal().clamp_min(1e-30)
-    seen = values > least
-    values = values.clamp_min(least)
+    seen, values = values > least, values.clamp_min(least)
     inverse = (axes * (seen / values)) @ axes.T
     inner = axes.T @ (scatter - scatter_bias) @ axes * (seen * seen[:, None])
     noise = (axes.T @ scatter_bias @ axes).diagonal()

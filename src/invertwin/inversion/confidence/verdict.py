@@ -71,8 +71,7 @@ def judge_fit(result: FitResult) -> Verdict:
         number = explained.index(min(explained)) + 1
         shown = f"{100 * min(explained):.2g} % of the power of observation {number}"
         return Verdict("lost", reasons=(f"the twin explains {shown}; start nearer to the truth",))
-    loss = float(fit.objective(result.maps))
-    begun = fit.loss_at_start()
+    loss, begun = float(fit.objective(result.maps)), fit.loss_at_start()
     if loss > _MAX_LOSS_RATIO * begun:
         return Verdict("worse", reasons=(f"the loss is {loss:.4g}, at the start {begun:.4g}",))
     bounds = tuple(

@@ -248,10 +248,8 @@ def candidate_poses(
         rectangle: rectangle around its points.
         radar: radar with its positions.
     """
-    center = item.center.detach()
-    start = item.transform.detach()
-    level = item.vertices.detach() - center
-    where = radar.positions.detach().mean(0)
+    center, start = item.center.detach(), item.transform.detach()
+    level, where = item.vertices.detach() - center, radar.positions.detach().mean(0)
     axes = yaw_rotation(rectangle.yaw)[:, :2]
     half = torch.tensor(rectangle.size).double() / 2
     away = (where - rectangle.center) @ axes

@@ -113,8 +113,7 @@ class Search:
 
     def to_metrics(self) -> dict[str, Any]:
         """Return the other results as numbers: pose difference, loss, score."""
-        best = self.best.scene
-        ends = []
+        best, ends = self.best.scene, []
         for end, score in zip(self.minima[1:], self.scores[1:], strict=True):
             pose = equivalents.describe_difference(best, end.scene, self.objects)
             ends.append({"pose": pose, "loss": end.loss, "score": score})

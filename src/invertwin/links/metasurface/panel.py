@@ -146,8 +146,7 @@ def panel_response(
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
     lit = channel.visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
     sent = _element_waves(panel, cells, tx, lit[: len(tx)], k, far_field)
-    weights = panel.response
-    scale = panel.spacing**2 * k / (2 * math.pi)
+    weights, scale = panel.response, panel.spacing**2 * k / (2 * math.pi)
     live = torch.nonzero((lit[len(tx) :] > 0).any(1) & bool((lit[: len(tx)] > 0).any()))[:, 0]
     heavy = len(live) * len(weights) > _VALUES_PER_CHUNK
     found = [torch.zeros(len(tx), 0, dtype=torch.complex128)]

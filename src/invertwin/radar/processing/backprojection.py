@@ -44,8 +44,7 @@ def backproject_beat(
     waveform = require_sampled_waveform(radar)
     tx, rx = (places.to(beat.device) for places in radar.elements())
     flat = points.reshape(-1, 3).to(beat.device)
-    middle = waveform.samples // 2
-    length = UPSAMPLING * waveform.samples
+    middle, length = waveform.samples // 2, UPSAMPLING * waveform.samples
     window = unit_window(radar.window, waveform.samples).to(beat.device)
     tapered = checked_beat(beat, radar).to(torch.complex128) * window
     # Samples are counted from the middle one, so that the phase varies slowly between bins.

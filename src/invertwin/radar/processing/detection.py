@@ -79,10 +79,9 @@ def cell_averaging_cfar(
         InputError: Power with gradients (a detection has none), values that are negative or not
             finite, no training cells, or a number out of range.
     """
-    band, count = _training_cells(power, guard, training, "cell_averaging_cfar")
     _check_rates(false_alarm, looks)
-    mean = torch.where(torch.isfinite(band), band, 0.0).sum(-1) / count
-    numbers, index = count.unique(return_inverse=True)
+    band, numbers, index = _training_cells(power, guard, training, "cell_averaging_cfar")
+    mean = torch.where(torch.isfinite(band), band, 0.0).sum(-1) / numbers[index]
     factors = f.isf(false_alarm, 2 * looks, 2 * looks * numbers.cpu().numpy())
     return power > torch.from_numpy(factors).to(mean)[index] * mean
 
@@ -110,10 +109,9 @@ def ordered_statistics_cfar(
     Raises:
         InputError: As ``cell_averaging_cfar``, or a rank outside (0, 1].
     """
-    band, count = _training_cells(power, guard, training, "ordered_statistics_cfar")
     _check_rates(false_alarm, looks)
     checked_number(rank, "rank", 0.0, 1.0, open_low=True)
-    numbers, index = count.unique(return_inverse=True)
+    band, numbers, index = _training_cells(power, guard, training, "ordered_statistics_cfar")
     places = (rank * numbers - 1e-9).ceil().long()
     # Other cells are infinite, so last in order.
     level = band.sort(-1).values.take_along_dim((places - 1)[index][..., None], -1)[..., 0]
@@ -146,9 +144,8 @@ def point_cloud(
     Raises:
         InputError: Power with gradients, or shapes that do not fit each other.
     """
-    _refuse_gradients(power, "point_cloud")
     expected = (radar.frame_count, power.shape[1], *grid.shape)
-    _check_shapes(power, detections, expected, "frame, velocity, range, u, v")
+    _check_map(power, detections, expected, "frame, velocity, range, u, v", "point_cloud")
     power, detections = power.to("cpu", torch.float64), detections.cpu()
     count = power.shape[1]
     seen = _mask_visible_region(power, grid).flatten(3)
@@ -187,8 +184,7 @@ def peaks(
     Raises:
         InputError: Power with gradients, or shapes that do not fit each other.
     """
-    _refuse_gradients(power, "peaks")
-    _check_shapes(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v")
+    _check_map(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v", "peaks")
     seen = _mask_visible_region(power.to("cpu", torch.float64), grid)
     highest = torch.from_numpy(maximum_filter(seen.numpy(), (1, 3, 3, 3), mode="nearest"))
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
@@ -198,10 +194,13 @@ def peaks(
     return _refine_points(seen[:, None], cell, rates, radar, grid)
 
 
-def _check_shapes(power: Tensor, detections: Tensor, expected: tuple[int, ...], axes: str) -> None:
+def _check_map(
+    power: Tensor, found: Tensor, expected: tuple[int, ...], axes: str, name: str
+) -> None:
+    _refuse_gradients(power, name)
     do = f"its axes are {axes}: use the radar and grid that the map was made with"
     check_shape(power, expected, "power", do)
-    check_shape(detections, expected[:3], "detections beside power", do)
+    check_shape(found, expected[:3], "detections beside power", do)
 
 
 def _mask_visible_region(power: Tensor, grid: Grid) -> Tensor:
@@ -256,8 +255,10 @@ def _check_rates(false_alarm: float, looks: int) -> None:
 
 def _training_cells(
     power: Tensor, guard: tuple[int, int], training: tuple[int, int], name: str
-) -> tuple[Float64[Tensor, "*batch first second cell"], Int64[Tensor, "*batch first second"]]:
-    """Return the power of each cell's training cells, infinite beyond the map, and their number."""
+) -> tuple[Float64[Tensor, "*batch first second cell"], Tensor, Tensor]:
+    """Return the power of each cell's training cells, infinite beyond the map, and their numbers:
+    all that occur, and the index of each cell's.
+    """
     _refuse_gradients(power, name)
     values = power.to(torch.float64)
     if not (torch.isfinite(values).all() and (values >= 0).all()):
@@ -274,8 +275,7 @@ def _training_cells(
     beside = (reach[1], reach[1], reach[0], reach[0])
     around = torch.nn.functional.pad(values, beside, value=math.inf)
     around = around.unfold(-2, sizes[0], 1).unfold(-2, sizes[1], 1)
-    numbers = [torch.arange(size, device=power.device) for size in sizes]
-    offsets = [(number - r).abs() for number, r in zip(numbers, reach, strict=True)]
+    offsets = [(torch.arange(size) - r).abs() for size, r in zip(sizes, reach, strict=True)]
     cells = around[..., (offsets[0][:, None] > guard[0]) | (offsets[1] > guard[1])]
     count = torch.isfinite(cells).sum(-1)
     if int(count.min()) < 1:
@@ -283,7 +283,7 @@ def _training_cells(
             f"expected training cells around every cell, got none around some of a map of "
             f"{tuple(values.shape[-2:])}; use fewer guard cells or more training cells"
         )
-    return cells, count
+    return cells, *count.unique(return_inverse=True)
 
 
 @lru_cache(maxsize=1024)
@@ -306,8 +306,7 @@ def _refinement(
     power: Float64[Tensor, "frame velocity range u v"], cell: list[Tensor], axis: int, wrap: bool
 ) -> _Values:
     """Return the sub-bin peak offset along one axis, within half a bin, 0 at an edge."""
-    size = power.shape[axis]
-    here = cell[axis]
+    size, here = power.shape[axis], cell[axis]
 
     def level(step: int) -> Tensor:
         place = (here + step) % size if wrap else (here + step).clamp(0, size - 1)

@@ -239,8 +239,7 @@ def _snapshots(
     taken = array.counts.flatten() > 0
     channels = profile.to(torch.complex128).flatten(2, 3).movedim(-1, 1)
     plane = array.plane(channels).flatten(-2)[..., taken.to(channels.device)]
-    y = array.y.repeat_interleave(rows)[taken]
-    z = array.z.repeat(columns)[taken]
+    y, z = array.y.repeat_interleave(rows)[taken], array.z.repeat(columns)[taken]
     uniform = bool(taken.all()) and _is_uniform(array.y) and _is_uniform(array.z)
     if (smoothing is not None or forward_backward) and not uniform:
         raise InputError(

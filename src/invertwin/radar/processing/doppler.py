@@ -130,10 +130,9 @@ def compensate_tdm(
     check_shape(spectrum, expected, what, "use the radar that recorded it")
     frames, count, transmitters, _, ranges = spectrum.shape
     folds = torch.as_tensor(fold, dtype=torch.float64, device=spectrum.device)
-    axis, starts = velocity_axis(radar, chirps, count), chirps.times(transmitters)[0]
-    rate = folds.expand(frames, count, ranges) * velocity_span(radar, chirps)
-    frequency = 2 / radar.waveform.wavelength * (rate + axis[:, None].to(rate))
-    cycles = frequency[:, :, None, :] * starts[:, None].to(rate)
+    axis, starts = velocity_axis(radar, chirps, count)[:, None], chirps.times(transmitters)[0]
+    rate = folds.expand(frames, count, ranges) * velocity_span(radar, chirps) + axis.to(folds)
+    cycles = 2 / radar.waveform.wavelength * rate[:, :, None] * starts[:, None].to(rate)
     turn = torch.exp(-2j * math.pi * (cycles - cycles.round()))
     return spectrum * turn[:, :, :, None].to(spectrum)
 
@@ -256,11 +255,10 @@ def micro_doppler(
             f"{step}; the signal has {count} chirps"
         )
     power = _doppler_transform(signal.unfold(-1, length, step), window, length).abs().square()
-    starts = torch.arange(power.shape[-2], dtype=torch.float64) * step
+    starts = torch.arange(power.shape[-2], dtype=torch.float64, device=power.device) * step
     loop = 0.5 * radar.waveform.wavelength / velocity_span(radar, chirps)
     times = (starts + 0.5 * (length - 1)) * loop
-    axes = times.to(power.device), velocity_axis(radar, chirps, length).to(power.device)
-    return Spectrogram(power, *axes)
+    return Spectrogram(power, times, velocity_axis(radar, chirps, length).to(power.device))
 
 
 def _steer_beams(

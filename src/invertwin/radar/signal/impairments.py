@@ -77,8 +77,8 @@ class PhaseNoise:
             level = self.levels[0] - 20 * torch.log10(offset / self.offsets[0])
         else:
             points = np.log10(np.asarray(self.offsets))
-            places = np.log10(offset.cpu().numpy())
-            level = torch.from_numpy(np.interp(places, points, self.levels)).to(offset)
+            level = torch.from_numpy(np.interp(offset.log10().cpu(), points, self.levels))
+            level = level.to(offset)
         return 2 * 10 ** (level / 10)
 
 

@@ -103,10 +103,10 @@ def _range_doppler_coupling(waveform: Waveform) -> float:
 
 def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
     """Return the power response |Σ w_n exp(2πj n x)|² of the chirps' window, x in cycles/loop."""
-    weight = unit_window(window, chirps.count).to(torch.complex128)
+    weight = unit_window(window, chirps.count).to(cycles.device, torch.complex128)
 
     def response(places: Tensor) -> Tensor:
-        turns = 2j * math.pi * places[:, None] * torch.arange(chirps.count)
+        turns = 2j * math.pi * places[:, None] * torch.arange(chirps.count).to(places)
         return (turns.exp() @ weight).abs().square()
 
     return interpolate_response(cycles, 1 / chirps.count, response)
