@@ -26,7 +26,7 @@ def to_double(values: Tensor) -> mit.Float64:
 
 def to_index(values: Tensor) -> mit.UInt32:
     """Convert a torch tensor of non-negative integers to a flat Dr.Jit index array."""
-    return mi.UInt32(_copy_aligned(values, torch.int32).view(torch.uint32))
+    return mi.UInt32(_copy_aligned(values, torch.uint32))
 
 
 def to_signed(values: Tensor) -> mit.Int32:
@@ -34,16 +34,17 @@ def to_signed(values: Tensor) -> mit.Int32:
     return mi.Int32(_copy_aligned(values, torch.int32))
 
 
-def _copy_aligned(values: Tensor, dtype: torch.dtype) -> Tensor:
+def _copy_aligned(values: Tensor, dtype: torch.dtype) -> np.ndarray | Tensor:
     """Copy a tensor into flat memory of torch, which is aligned to 64 bytes.
 
     Dr.Jit reads such memory in place; for other alignments, as NumPy's may be, it compiles separate
-    kernels. Tensors on a GPU that traces stay there.
+    kernels. What is on the GPU that traces stays there.
     """
     with _DisableFuncTorch():  # within `torch.func`, even new tensors are wrapped
         given = strip_derivatives(values)
         device = given.device if backend() == "cuda" else torch.device("cpu")
-        return torch.empty(given.shape, dtype=dtype, device=device).copy_(given).ravel()
+        flat = torch.empty(given.shape, dtype=dtype, device=device).copy_(given).ravel()
+        return flat if flat.is_cuda else flat.numpy()
 
 
 def to_points(values: Float64[Tensor, "n 3"] | Float32[Tensor, "n 3"]) -> mit.Float:
@@ -86,14 +87,14 @@ def to_torch(values: mit.Float | mit.UInt32 | mit.Int32 | mit.Bool) -> Tensor:
 
 
 def view_as_torch(values: mit.Float) -> Tensor:
-    """View a flat Dr.Jit array as a torch tensor, read-only; arrays on a GPU are copied.
+    """View a flat Dr.Jit array as a torch tensor, read-only; arrays on a GPU are copied to the CPU.
 
     Args:
         values: flat Dr.Jit array.
     """
     dr.eval(values)
     dr.sync_thread()
-    return torch.from_dlpack(values).cpu()
+    return to_torch(values) if backend() == "cuda" else torch.from_dlpack(values)
 
 
 def opaque(value: float | int, type_name: str = "UInt32") -> Any:
