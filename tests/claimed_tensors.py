@@ -30,7 +30,11 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
-from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+from torch.utils.backend_registration import (
+    _DummyBackendModule,
+    _DummyPrivateUse1Hook,
+    _setup_privateuseone_for_python_backend,
+)
 
 import invertwin
 import public_names
@@ -174,10 +178,22 @@ def _resolve(value: Any) -> Any:
     return value.resolve_conj().resolve_neg() if isinstance(value, Tensor) else value
 
 
+class _NoModule(_DummyBackendModule):
+    def is_available(self) -> bool:
+        """Return that torch has no accelerator, on which it would store states, for example."""
+        return False
+
+
+class _NoHook(_DummyPrivateUse1Hook):
+    def is_available(self) -> bool:
+        """Return the same to the part of torch that is written in C++."""
+        return False
+
+
 @cache
 def register() -> torch.library.Library:
     """Make `DEVICE` known to torch: before the first derivative of the process."""
-    _setup_privateuseone_for_python_backend(DEVICE)
+    _setup_privateuseone_for_python_backend(DEVICE, _NoModule(), _NoHook())
     library = torch.library.Library("aten", "IMPL")
 
     # What autograd and `torch.tensor` ask for below the mode.
