@@ -20,9 +20,9 @@ ARRAY = lk.AntennaMount(linear_array(2, 0.04))
 TURNED = lk.AntennaMount(linear_array(2, 0.04), torch.eye(3).double().expand(2, 3, 3))
 MEASURED = lk.AntennaMount(
     AntennaArray(
-        torch.zeros(1, 3),
+        torch.zeros(1, 3, dtype=torch.float64),
         TabulatedPattern.from_decibels((0.0, 1.0, 3.0), ((0.0,), (-3.0,), (-20.0,))),
-        JonesTable([0.0, 1.0], [0.0], complex128([[[1, 0.1]], [[0.5, 1j]]])),
+        JonesTable(float64([0.0, 1.0]), float64([0.0]), complex128([[[1, 0.1]], [[0.5, 1j]]])),
     )
 )
 SETTINGS = lk.PropagationSettings(FREQUENCY, 20e6)
@@ -70,7 +70,7 @@ CASES: dict[str, Case] = {
     "angle_spread": lambda move: lk.angle_spread(move(paths())),
     "delay_spread": lambda move: lk.delay_spread(move(paths())),
     "frequency_response": lambda move: lk.frequency_response(
-        move(paths()), [3.4e9, 3.5e9], tx=ARRAY, rx=TURNED
+        move(paths()), float64([3.4e9, 3.5e9]), tx=ARRAY, rx=TURNED
     ),
     "impulse_response": lambda move: lk.impulse_response(move(paths()), bandwidth=1e9, taps=4),
     "ofdm_channel": lambda move: lk.ofdm_channel(

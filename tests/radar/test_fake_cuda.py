@@ -19,7 +19,10 @@ pytestmark = pytest.mark.fake_cuda
 HALF = 0.5 * SPEED_OF_LIGHT / 77e9
 CHIRP = rd.FMCW(76.5e9, 1e9, 40e-6, 32)
 RADAR = rd.Radar(
-    linear_array(2, 4 * HALF), linear_array(4, HALF), CHIRP, [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
+    linear_array(2, 4 * HALF),
+    linear_array(4, HALF),
+    CHIRP,
+    float64([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]),
 )
 TRAIN, SHORT = rd.Chirps(8, 60e-6), rd.Chirps(2, 60e-6)
 GRID = RADAR.grid(1.0, 3.5)
@@ -120,7 +123,7 @@ def signal_gradient(move: Move) -> list[Tensor]:
 
 SURROGATE = rd.Surrogate(range_width=3.0, angle_width=1.5)
 AIRY = rd.Surrogate(angle_kernel="airy")
-BIASED = replace(RADAR, range_bias=torch.tensor(0.03))
+BIASED = replace(RADAR, range_bias=float64(0.03))
 
 CASES: dict[str, Case] = {
     "Impairments.apply": lambda move: impair(move, "apply"),
