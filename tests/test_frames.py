@@ -71,7 +71,14 @@ def test_raw_files_are_looked_at_as_points(tmp_path: Path, monkeypatch: pytest.M
     few = iw.Sampling(depth=1, conductor_samples=200_000)
     beat = iw.simulate_chirps(balls, sensor, chirps, seed=1, sampling=few)
     settings = make_settings(
-        sensor.waveform, (1, 2, 3), (1, 2, 3, 4), loops=2, frames=1, idle_time=100e-6, lanes=2
+        sensor.waveform,
+        (1, 2, 3),
+        (1, 2, 3, 4),
+        loops=2,
+        frames=1,
+        frame_period=0.1,
+        idle_time=100e-6,
+        lanes=2,
     )
     write_samples("adc.bin", adc_counts(beat, settings, 1.5 * float(beat.abs().max())))
     write_cfg("adc.cfg", settings)

@@ -306,6 +306,7 @@ _SETTINGS = ChirpSettings(
     loops=2,
     frames=2,
     frame_period=0.1,
+    idle_time=7e-6,
     lanes=2,
 )
 

@@ -59,9 +59,7 @@ def locate(
             that is not positive and below the radius.
     """
     if not 0 < step < radius:
-        raise InputError(
-            f"expected 0 < step < radius, got {step} and {radius}; give both in metres"
-        )
+        raise InputError(f"expected 0 < step < radius, got {step} and {radius}; give metres")
     interpolator, radar = capture.interpolator(), capture.radar()
 
     def brightness(offset: Float64[Tensor, "point 2"]) -> Float64[Tensor, " point"]:
@@ -105,9 +103,7 @@ def _maximise_measure(measure: FocusMeasure, spans: Sequence[tuple[float, float]
 
     The spans are half the width and the step of the grid along each axis.
     """
-    axes = [
-        torch.arange(-reach, reach + step / 2, step, dtype=torch.float64) for reach, step in spans
-    ]
+    axes = [torch.arange(-half, half + step / 2, step, dtype=torch.float64) for half, step in spans]
     trials = torch.cartesian_prod(*axes)
     # A column of the grid at a time keeps the memory of frames × points small.
     values = torch.cat([measure(part) for part in trials.split(len(axes[1]))])

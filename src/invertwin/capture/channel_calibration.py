@@ -71,9 +71,8 @@ class ChannelCalibration:
             InputError: no such file, or one that holds no calibration.
         """
         with convert_read_errors(path, "a calibration, gains [tx][rx][real, imaginary]"):
-            parts = torch.tensor(
-                json.loads(read_text(path, "a calibration"))["gains"], dtype=torch.float64
-            )
+            content = json.loads(read_text(path, "a calibration"))
+            parts = torch.tensor(content["gains"], dtype=torch.float64)
             if parts.ndim != 3 or parts.shape[2] != 2:
                 raise ValueError(f"shape {tuple(parts.shape)}")
         calibration = cls(torch.view_as_complex(parts))

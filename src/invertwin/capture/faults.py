@@ -25,6 +25,8 @@ _LEAKAGE_CELLS = 3  # from range zero, in which leakage outshines everything
 _MAX_SAMPLES, _MAX_CHANNELS = 2**20, 64  # that are looked at
 _STRONGEST_RATES = 3  # strongest range rates of a frame in which a pattern is looked for
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "faults.toml")
+
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]
 _LimitedBeat = Complex128[Tensor, "frame chirp tx rx sample"]  # not more than is looked at
 _Rates = Complex128[Tensor, "rate channel sample"]
@@ -35,8 +37,8 @@ class Fault:
     """A fault of a recording.
 
     Attributes:
-        name: ``complex only by type``, ``detect_ghosts``, ``dropped samples``, ``phase break``,
-            ``detect_leakage`` or ``detect_saturation``.
+        name: ``complex only by type``, ``ghosts``, ``dropped samples``, ``phase break``,
+            ``leakage`` or ``saturation``.
         evidence: Evidence in the samples, and the remedy.
     """
 
@@ -45,6 +47,11 @@ class Fault:
 
     def __str__(self) -> str:
         return f"{self.name}: {self.evidence}"
+
+
+def _fault(name: str, *values: float | str) -> Fault:
+    """A fault with its evidence, whose text is that of `faults.toml`."""
+    return Fault(name, _TEXTS[name].format(*values))
 
 
 def find_faults(
@@ -139,12 +146,7 @@ def detect_saturation(beat: _Beat, *, real: bool) -> Fault | None:
         least = 3 * math.sqrt(step / (_BAND * size))
         many = hits >= max(_MIN_CLIPPED_COUNT, _MIN_CLIPPED_FRACTION * values.numel())
         if step * _MIN_CODES <= size and many and hits > max(_MIN_END_FRACTION, least) * beside:
-            return Fault(
-                "saturation",
-                f"{hits / values.numel():.2g} of the values are at one end of their range, "
-                f"{beside / values.numel():.2g} in the tenth of it beside: the converter has "
-                "clipped them and echoes show harmonics; lower the gain of the receivers",
-            )
+            return _fault("saturation", hits / values.numel(), beside / values.numel())
     return None
 
 
@@ -174,11 +176,7 @@ def detect_lost_samples(beat: _Beat, *, real: bool) -> Fault | None:
     share = max(int((zero & ~long).sum()), 1) / max(int((~long).sum()), 1)
     if longest < _MIN_RUN_LENGTH or zero.numel() * share**longest > _FALSE_ALARM_PROBABILITY:
         return None
-    return Fault(
-        "dropped samples",
-        f"{int(long.sum())} of {zero.numel()} samples are zeros in runs of up to {longest}: "
-        "packets were lost on the way; record again with a faster disk or link",
-    )
+    return _fault("dropped samples", int(long.sum()), zero.numel(), longest)
 
 
 def _zero_run_lengths(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:
@@ -225,12 +223,7 @@ def detect_iq_images(beat: _LimitedBeat) -> Fault | None:
     least = float((turned.sum(0) / level.sum(0).clamp_min(torch.finfo(torch.float64).tiny)).min())
     if weighted < _MIN_TOTAL_COHERENCE or least < _MIN_BIN_COHERENCE:
         return None
-    return Fault(
-        "complex only by type",
-        f"frequencies and their negatives agree to {weighted:.4g} (coherence; 1 = real samples): "
-        "every echo has a mirror image in range and direction; give the samples as real ones, "
-        "which serve half the range, or record I and Q",
-    )
+    return _fault("complex only by type", weighted)
 
 
 # The ghost's energy over the power of noise in one cell: below, a ghost is none that counts. What
@@ -241,7 +234,6 @@ _MIN_PEAK_TO_SURROUNDINGS = 10.0
 # Share of a spectrum without echoes; what its window leaves.
 _NOISE_ONLY_FRACTION, _WINDOW_FLOOR = 0.2, 1e-10
 _MAX_IQ_IMAGE = 0.7  # of the echo's amplitude
-_CAUSES = read_table("invertwin.capture", "faults.toml")
 _MIN_RELATIVE_ECHO = 1e-4  # of the strongest one's power, that is searched for ghosts
 
 
@@ -276,9 +268,8 @@ def detect_ghosts(
     noise = max(noise_power(own_half, looks, _NOISE_ONLY_FRACTION), _WINDOW_FLOOR * top)
     highest = (power >= power.roll(1)) & (power > power.roll(-1))
     strong = highest & (power > _MIN_RELATIVE_ECHO * top) & (power > _MIN_GHOST_TO_NOISE * noise)
-    kinds = (
-        [(0.5, -1.0, True)] if real else [(0.0, -1.0, True), (0.5, 1.0, False), (0.5, -1.0, True)]
-    )
+    # Of real samples only the last is a copy.
+    kinds = [(0.0, -1.0, True), (0.5, 1.0, False), (0.5, -1.0, True)][2 if real else 0 :]
     for place in torch.nonzero(strong)[:, 0].tolist():
         echo = place / (4 * count)
         own = _adjacent_lines(tapered, echo)
@@ -302,12 +293,9 @@ def detect_ghosts(
                 and float(factor.abs()) < (1.05 if offset else _MAX_IQ_IMAGE)
             ):
                 level = -20 * math.log10(float(factor.abs()))
-                shown = (
-                    f"the echo at {echo * waveform.max_range:.3g} m has a copy at "
-                    f"{at * waveform.max_range:.3g} m, {level:.0f} dB weaker and alike in all "
-                    "channels"
-                )
-                return Fault("ghosts", shown + _CAUSES["odd_samples" if offset else "unlike_iq"])
+                places = echo * waveform.max_range, at * waveform.max_range
+                cause = _TEXTS["odd_samples" if offset else "unlike_iq"]
+                return _fault("ghosts", *places, level, cause)
     return None
 
 
@@ -352,7 +340,7 @@ def detect_phase_break(beat: _LimitedBeat, *, real: bool) -> Fault | None:
     away[max(place - order + 1, 0) : place + order] = False
     found = _outlier_ratio(left, left[away], len(rows)) if bool(away.any()) else None
     if found is not None:
-        return _phase_break_fault(place + first, found, "chirps")
+        return _fault("phase break", place + first, "chirps", found)
     chirps = beat.flatten(0, 1).flatten(1, 2)[..., settled:]
     if len(chirps) < _MIN_CHIRPS:
         return None
@@ -365,7 +353,7 @@ def detect_phase_break(beat: _LimitedBeat, *, real: bool) -> Fault | None:
     if found is None:
         return None
     chirp, place = divmod(int(each.argmax()), each.shape[1])
-    return _phase_break_fault(place + first, found, f"chirp {chirp % beat.shape[1]}")
+    return _fault("phase break", place + first, f"chirp {chirp % beat.shape[1]}", found)
 
 
 def _power_at(power: Float64[Tensor, " bin"], frequency: float) -> float:
@@ -382,15 +370,6 @@ def _power_beside(power: Float64[Tensor, " bin"], frequency: float) -> float:
 def _window_means(values: Tensor, count: int) -> Tensor:
     """Means over the windows of prediction that a break at each place cuts."""
     return values.unfold(-1, count, 1).mean(-1)
-
-
-def _phase_break_fault(sample: int, ratio: float, where: str) -> Fault:
-    return Fault(
-        "phase break",
-        f"sample {sample} of {where} does not follow from the samples before it (residual "
-        f"{ratio:.3g} times the median): the ramp was not one, or samples are missing; check when "
-        "the synthesiser settles, and the samples per chirp in the settings",
-    )
 
 
 def _outlier_ratio(values: Tensor, reference: Tensor, averages: int) -> float | None:
@@ -472,16 +451,9 @@ def detect_leakage(
     if bool(free.any()):
         best = int(torch.where(free, power, 0.0).argmax())
         level = 10 * math.log10(float(power[strongest] / power[best]))
-        advice = (
-            f"the strongest echo beyond is at {float(ranges[best]):.3g} m, {level:.0f} dB weaker: "
-            f"give --range-min "
-            f"{0.5 * (float(ranges[best]) + max(_BOARD_RANGE, search_range[0])):.2g}"
-        )
-    return Fault(
-        "leakage",
-        f"the strongest echo, at {float(ranges[strongest]):.3g} m, is the transmitters heard over "
-        f"the board (at {float(near[source]):.2g} m) or its sidelobes; {advice}",
-    )
+        between = 0.5 * (float(ranges[best]) + max(_BOARD_RANGE, search_range[0]))
+        advice = _TEXTS["beyond_leakage"].format(float(ranges[best]), level, between)
+    return _fault("leakage", float(ranges[strongest]), float(near[source]), advice)
 
 
 def _limit_samples(beat: _Beat) -> _LimitedBeat:

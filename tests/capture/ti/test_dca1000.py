@@ -30,6 +30,7 @@ SETTINGS = ChirpSettings(
     loops=2,
     frames=3,
     frame_period=0.1,
+    idle_time=7e-6,
     lanes=2,
 )
 KINDS = [

@@ -7,9 +7,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invertwin.capture import ChirpData, ChirpSettings
-from invertwin.capture.ti import read_cfg, read_settings, read_studio, write_cfg, write_studio
+from invertwin.capture import ChirpData, ChirpSettings, make_settings
+from invertwin.capture.ti import (
+    add_demo_times,
+    read_cfg,
+    read_settings,
+    read_studio,
+    write_cfg,
+    write_studio,
+)
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.radar import FMCW
 
 # An xWR18xx demo profile: three transmitters in the order TX1, TX3, TX2.
 CFG = """\
@@ -23,7 +31,7 @@ dfeDataOutputMode 1
 channelCfg 15 7 0
 adcCfg 2 1
 adcbufCfg -1 0 1 1 1
-profileCfg 0 77.01 7 6.5 57.14 0 0 70 1 256 5209 0 0 30
+profileCfg 0 77.005 7 6.5 57 0 0 70 1 256 5209 0 0 30
 chirpCfg 0 0 0 0 0 0 0 1
 chirpCfg 1 1 0 0 0 0 0 4
 chirpCfg 2 2 0 0 0 0 0 2
@@ -34,7 +42,7 @@ lvdsStreamCfg -1 0 1 0
 sensorStart
 """
 EXPECTED = ChirpSettings(
-    start_frequency=77.01e9,
+    start_frequency=77.005e9,
     slope=70e12,
     sample_rate=5.209e6,
     samples=256,
@@ -44,15 +52,16 @@ EXPECTED = ChirpSettings(
     frame_period=0.1005,
     idle_time=7e-6,
     adc_start_time=6.5e-6,
-    ramp_end_time=57.14e-6,
+    ramp_end_time=57e-6,
     swap_iq=True,
     lanes=2,
 )
 CASES = [
     EXPECTED,
     replace(EXPECTED, frames=12, receivers=(1, 3), swap_iq=False, real=True),
-    replace(EXPECTED, lanes=4, bits=12, transmit_order=(2,), start_frequency=60.25e9),
-    replace(EXPECTED, slope=29.982e12, frame_period=None, adc_start_time=0.0, bits=14),
+    replace(EXPECTED, lanes=4, bits=12, transmit_order=(2,)),
+    replace(EXPECTED, start_frequency=60.0025e9, real=True, loops=255, frame_period=0.0493),
+    replace(EXPECTED, slope=29.982e12, adc_start_time=0.0, bits=14),
     replace(EXPECTED, range_bias=0.07, channel_factors=[[[0.5, -0.25]] * 4] * 3),
 ]
 
@@ -135,7 +144,7 @@ def test_a_reflector_appears_in_its_direction_through_channels_of_both_signs(cfg
     ],
 )
 def test_transmitters_that_differ_are_a_warning(cfg, power, phase, message):
-    path = cfg("57.14 0 0 70", f"57.14 {power} {phase} 70")
+    path = cfg("57 0 0 70", f"57 {power} {phase} 70")
     if message is None:
         assert read_cfg(path) == EXPECTED
     else:
@@ -169,12 +178,95 @@ def test_settings_survive_a_cfg(tmp_path, settings):
 
 
 @pytest.mark.parametrize(
-    ("start", "lanes", "device"), [(60e9, 2, "xWR68xx"), (77e9, 2, "xWR18xx"), (77e9, 4, "xWR1443")]
+    ("start", "lanes", "device"), [(60e9, 2, "xWR68xx"), (77e9, 2, "xWR18xx"), (77e9, 4, "xWR14xx")]
 )
 def test_a_cfg_names_a_device_of_its_band(tmp_path, start, lanes, device):
     path = tmp_path / "written.cfg"
     write_cfg(path, replace(EXPECTED, start_frequency=start, lanes=lanes))
     assert path.read_text().splitlines()[0] == f"% Platform:{device}"
+
+
+def test_a_cfg_names_the_device_of_the_board(tmp_path):
+    path = tmp_path / "written.cfg"
+    two = replace(EXPECTED, transmit_order=(1, 2))
+    write_cfg(path, two, "xWR1642")
+    assert path.read_text().splitlines()[0] == "% Platform:xWR16xx"
+    assert read_cfg(path) == two
+
+
+@pytest.mark.parametrize(
+    ("device", "changes", "message"),
+    [
+        # 77.005 GHz + 70 MHz/µs · 57.14 µs = 81.0048 GHz
+        ("", {"ramp_end_time": 57.14e-6}, r"end of the ramp \[GHz\] is 81.0048, not 77 to 81"),
+        ("", {"start_frequency": 76.9e9}, r"end of the ramp \[GHz\] is 80.89, not 76 to 78"),
+        ("IWR6843ISK", {}, r"no xWR68xx .*start frequency \[GHz\] is 77.005, not 60 to 64"),
+        (
+            "",
+            {
+                "slope": 101e12,
+                "start_frequency": 77e9,
+                "adc_start_time": 0.0,
+                "ramp_end_time": 39e-6,
+                "samples": 200,
+            },
+            r"slope \[MHz/µs\] is 101, not 0 to 100$",
+        ),
+        (
+            "xWR1642",
+            {"sample_rate": 6.3e6, "transmit_order": (1, 2)},
+            r"complex samples \[Msps\] is 6.3, not 2 to 6.25$",
+        ),
+        ("xWR1642", {}, "number of a transmitter is 3, not 1 to 2$"),
+        # 2 · 2 · 1025 · 4
+        (
+            "xWR1443",
+            {
+                "samples": 1025,
+                "lanes": 4,
+                "sample_rate": 18e6,
+                "ramp_end_time": 57e-6 + 9e-6,
+                "slope": 60e12,
+            },
+            r"memory of a chirp \[byte\] is 16400, not 1 to 16384$",
+        ),
+        ("", {"idle_time": 0.0}, r"idle time \[µs\] is 0, not 2 to 5242.87$"),
+        ("", {"loops": 256}, "loops is 256, not 1 to 255$"),
+        ("", {"frames": 65536}, "frames is 65536, not 0 to 65535$"),
+        # 16 · 3 · 64 µs = 3.072 ms of chirps
+        ("", {"frame_period": 3.3e-3}, r"pause .* \[ms\] is 0.228, not 0.3 to 1342$"),
+        ("", {"frame_period": None}, r"pause after the chirps of a frame \[ms\] is -3.072"),
+    ],
+)
+def test_a_cfg_that_no_device_takes_is_a_warning(tmp_path, device, changes, message):
+    path, settings = tmp_path / "written.cfg", replace(EXPECTED, **changes)
+    with pytest.warns(PhysicsWarning, match=message):
+        write_cfg(path, settings, device)
+    assert read_cfg(path) == settings
+
+
+def test_times_of_the_demos_keep_what_is_sampled(tmp_path):
+    """6 µs of 13 to 20 µs of idle time become that to the ADC start, if the band reaches."""
+    waveform = FMCW(61e9, 2e9, 40e-6, 128)
+    settings = make_settings(waveform, 3, 4, loops=16, idle_time=20e-6, lanes=2)
+    timed = add_demo_times(settings)
+    assert (timed.adc_start_time, timed.idle_time) == (6e-6, 14e-6)
+    assert timed.start_frequency == pytest.approx(61e9 - 6 * 50e6)
+    assert timed.waveform.start_frequency == pytest.approx(61e9)
+    assert timed.chirps == settings.chirps
+    assert timed.frame_period == 4e-3  # 16 · 3 · 60 µs = 2.88 ms, and 0.3 ms
+    write_cfg(tmp_path / "timed.cfg", timed)
+    assert read_cfg(tmp_path / "timed.cfg").chirps.interval == pytest.approx(60e-6)
+    assert add_demo_times(timed) == timed
+    # 60.1 GHz - 2 µs · 50 MHz/µs is the end of the band; 9 µs of idle time leave 2 µs, too.
+    for start, idle in ((60.1e9, 20e-6), (61e9, 9e-6)):
+        less = replace(settings, start_frequency=start, idle_time=idle, frame_period=0.1)
+        assert add_demo_times(less).adc_start_time == pytest.approx(2e-6)
+        assert add_demo_times(less).frame_period == 0.1
+    # A 77 GHz device has no room below 77 GHz for a ramp that ends above 78 GHz.
+    high = replace(settings, start_frequency=77e9)
+    assert add_demo_times(high).adc_start_time == 0
+    assert add_demo_times(replace(high, slope=20e12)).adc_start_time == 6e-6
 
 
 @pytest.mark.parametrize("settings", CASES[:-1])  # it has no place for a calibration
@@ -190,7 +282,7 @@ def test_settings_survive_mmwave_studio(tmp_path, settings):
     [
         ("channelCfg 15 7 0\n", "", "expected a line channelCfg"),
         ("chirpCfg", "chirp", "expected a line chirpCfg"),
-        ("profileCfg 0 77.01", "profileCfg 0 high", "numbers as arguments in profile.cfg"),
+        ("profileCfg 0 77.005", "profileCfg 0 high", "numbers as arguments in profile.cfg"),
         ("frameCfg 0 2 16 0 100.5 1 0", "frameCfg 0 2", "at least 5 arguments of frameCfg"),
         ("frameCfg 0 2", "frameCfg 0 3", "got none for 3"),
         ("chirpCfg 1 1 0 0 0 0 0 4", "chirpCfg 1 1 0 0 0 0 0 5", "one transmitter per chirp"),
@@ -211,7 +303,7 @@ def test_settings_survive_mmwave_studio(tmp_path, settings):
         ("lowPower 0 0", "bpmCfgAdvanced 0 1 2", "false range rates"),
         ("adcbufCfg -1 0", "adcbufCfg -1 1", "format 0 as adcCfg says, .* got 1 and 1"),
         ("adcbufCfg -1 0 1 1", "adcbufCfg -1 0 1 0", "interleaving 1 as the device does, got 0"),
-        ("57.14", "40", "ramp of at least"),
+        (" 57 ", " 40 ", "ramp of at least"),
     ],
 )
 def test_a_cfg_that_cannot_be_used_is_refused(cfg, old, new, message):

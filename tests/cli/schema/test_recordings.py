@@ -39,7 +39,7 @@ positions = [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]
 
 [radar.waveform]
 kind = "fmcw"
-start_frequency = 77e9
+start_frequency = 77.25e9
 bandwidth = 2e9
 duration = 32e-6
 samples = 64
@@ -207,11 +207,13 @@ def test_a_train_is_written_as_arrays_and_as_raw_files(train):
     cfg = read_cfg(train / "raw" / "capture.cfg")
     assert cfg == read_settings(train / "raw" / "capture.mmwave.json")
     assert replace(counts.settings, frames=2) == cfg
+    first = (train / "raw" / "capture.cfg").read_text().splitlines()[0]
+    assert first == "% Platform:xWR16xx"
     assert cfg.chirps.interval == pytest.approx(40e-6)
     assert cfg.frame_period == 0.1
-    assert (cfg.start_frequency, cfg.adc_start_time) == (76.75e9, 4e-6)
+    assert (cfg.start_frequency, cfg.adc_start_time) == (77e9, 4e-6)
     assert cfg.idle_time == pytest.approx(4e-6)
-    assert cfg.waveform == FMCW(77e9, 2e9, 32e-6, 64)
+    assert cfg.waveform == FMCW(77.25e9, 2e9, 32e-6, 64)
 
 
 @pytest.mark.slow
@@ -314,7 +316,7 @@ def test_recordings_that_do_not_fit_are_refused(train, changes, message):
         ),
         ("[raw]", "[raw]\nfull_scale = -1.0", "raw.full_scale"),
         (
-            'kind = "fmcw"\nstart_frequency = 77e9\nbandwidth = 2e9\nduration = 32e-6',
+            'kind = "fmcw"\nstart_frequency = 77.25e9\nbandwidth = 2e9\nduration = 32e-6',
             'kind = "stepped"\nstart_frequency = 77e9\nstep = 30e6\ndwell = 1e-6',
             'raw: expected radar.waveform.kind = "fmcw"',
         ),

@@ -232,9 +232,8 @@ def load_description(
         InputError: no such file, no TOML, or another frame, other sections or keys.
     """
     text = untrusted.read_text(path, "a TOML description")
-    with untrusted.convert_read_errors(
-        path, "TOML", "give the description of the data, not the data"
-    ):
+    do = "give the description of the data, not the data"
+    with untrusted.convert_read_errors(path, "TOML", do):
         description = tomllib.loads(text)
     frame = description.pop("frame", None)
     if frame not in (None, FRAME):
@@ -305,12 +304,11 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
 def _load_file(path: Path, suffix: str, variable: str | None, *, trusted: bool) -> np.ndarray:
     if suffix == ".npy":
         return untrusted.read_npy(path)
+    name = str(variable)
     if suffix == ".npz":
-        return untrusted.read_arrays(path, "it is damaged or of another kind", [str(variable)])[
-            str(variable)
-        ]
+        return untrusted.read_arrays(path, "it is damaged or of another kind", [name])[name]
     kind = "matlab" if suffix == ".mat" else "hdf5"
-    return read_isolated(path, kind, str(variable), trusted=trusted).arrays[str(variable)].values
+    return read_isolated(path, kind, name, trusted=trusted).arrays[name].values
 
 
 def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) -> np.ndarray:

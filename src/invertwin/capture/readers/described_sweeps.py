@@ -203,9 +203,8 @@ def _find_data_files(path: Path, data: dict[str, Any]) -> list[Path]:
         return [untrusted.named_file(path, str(data["file"]))]
     named = data["files"]
     if isinstance(named, str):
-        pattern = untrusted.named_file(
-            path, named
-        )  # of names, not of folders: those may be many, or links
+        # Of names, not of folders: those may be many, or links.
+        pattern = untrusted.named_file(path, named)
         matches = pattern.parent.glob(pattern.name)
         named = sorted(str(file.relative_to(path.parent)) for file in matches)
     found = [untrusted.named_file(path, str(name)) for name in named]

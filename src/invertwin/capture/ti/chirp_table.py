@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
+from string import Template
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
@@ -11,8 +12,6 @@ from invertwin.errors import InputError
 
 FIELDS = read_table("invertwin.capture.ti", "fields.toml")
 """Names and places of numbers in both kinds of file."""
-# By the first two digits of the device; later ones record through several kinds of link.
-_LANES = {"12": 4, "14": 4, "16": 2, "18": 2, "68": 2}
 # Numbers of a profile, and the power of ten of the units in which both kinds of file have them.
 _PROFILE: dict[str, int] = FIELDS["profile"]
 _MAX_CHIRPS = 512  # that a front end can define
@@ -51,16 +50,53 @@ def numbers_to_bits(chosen: Sequence[int]) -> int:
     return sum(1 << (number - 1) for number in chosen)
 
 
-def device_lanes(device: str) -> int | None:
-    """LVDS lanes of a device such as xWR1843 or xWR18xx; None if the name does not say."""
+def device_family(device: str) -> str:
+    """First two digits of a device such as xWR1843 or xWR18xx; none if it is not known."""
     match = re.search(r"[xai]wr(\d\d)", device.lower())
-    return _LANES.get(match.group(1)) if match else None
+    return match.group(1) if match and match.group(1) in FIELDS["devices"] else ""
 
 
-def profile_texts(chirp_settings: ChirpSettings) -> list[str]:
-    """The numbers of a profile as texts, in the order in which `frame_settings` reads them."""
-    numbers = vars(chirp_settings) | {"ramp_end_time": chirp_settings.ramp_time}
-    return [format_decimal(numbers[name], -exponent) for name, exponent in _PROFILE.items()]
+def device_lanes(device: str) -> int | None:
+    """LVDS lanes of a device; None if its name does not say, as of those with several links."""
+    family = device_family(device)
+    return FIELDS["devices"][family]["lanes"] if family else None
+
+
+def fill_file(
+    kind: str, chirp_settings: ChirpSettings, mask: str, separator: str, **values: Any
+) -> str:
+    """Text of a file of settings.
+
+    Args:
+        kind: "cfg" or "studio", the file of `fields.toml`.
+        chirp_settings: settings to write.
+        mask: format of a mask of elements.
+        separator: text between two chirps.
+        values: further values of the file.
+    """
+    s = chirp_settings
+    numbers = vars(s) | {"ramp_end_time": s.ramp_time}
+    chirp = Template(FIELDS[f"{kind}_chirp"])
+    chirps = (
+        chirp.substitute(number=number, transmitters=format(numbers_to_bits([tx]), mask))
+        for number, tx in enumerate(s.transmit_order)
+    )
+    return Template(FIELDS[f"{kind}_file"]).substitute(
+        {name: format_decimal(numbers[name], -exponent) for name, exponent in _PROFILE.items()},
+        receivers=format(numbers_to_bits(s.receivers), mask),
+        transmitters=format(numbers_to_bits(s.transmit_order), mask),
+        bits=BIT_CODES[s.bits],
+        complex=int(not s.real),
+        real=int(s.real),
+        swap=int(s.swap_iq),
+        blocks=int(s.lanes != 4),
+        chirps=separator.join(chirps),
+        last=len(s.transmit_order) - 1,
+        loops=s.loops,
+        frames=s.frames or 0,
+        period=format_decimal(s.frame_period or 0, 3),
+        **values,
+    )
 
 
 def frame_settings(
@@ -74,7 +110,7 @@ def frame_settings(
 
     Args:
         profiles: profile number → its numbers.
-        keys: where a profile has the numbers of `profile_texts`.
+        keys: where a profile has the numbers of `[profile]`.
         chirps: first and last chirp, their profile, mask of their transmitters, and whether they
             vary from the profile.
         frame: first and last chirp, loops, frames (0 = endless), period [ms].

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
+from invertwin.capture.ti.device_limits import frame_duration
 from invertwin.checks import check_choice, checked_count
 from invertwin.errors import InputError
 
@@ -181,11 +182,10 @@ def find_candidates(words: np.ndarray, settings: ChirpSettings) -> list[LayoutCa
                         alike[period] = block_coherence(words, made)
                     found.append(LayoutCandidate(chosen | solved, made, known[key], alike[period]))
 
-    def sort_key(one: LayoutCandidate) -> tuple[Any, ...]:
-        breaks = one.evidence.breaks_at_borders
-        return (not breaks, one.evidence.code_length if breaks else 0.0, len(one.changes))
-
-    return sorted(found, key=sort_key)
+    breaking = [one for one in found if one.evidence.breaks_at_borders]
+    breaking.sort(key=lambda one: (one.evidence.code_length, len(one.changes)))
+    others = [one for one in found if not one.evidence.breaks_at_borders]
+    return breaking + sorted(others, key=lambda one: len(one.changes))
 
 
 def _active_lanes(words: np.ndarray) -> tuple[int, ...]:
@@ -238,8 +238,8 @@ def _apply_changes(changes: dict[str, Any], settings: ChirpSettings) -> ChirpSet
         made = change_settings(settings, changes)
     except InputError:  # the ramp does not hold the samples
         return None
-    ramps = made.loops * len(made.transmit_order) * (made.idle_time + made.ramp_time)
-    late = made.frame_period is not None and ramps > made.frame_period * (1 + 1e-9)
+    period = made.frame_period
+    late = period is not None and frame_duration(made) > period * (1 + 1e-9)
     return None if late or layout_error(made) is not None else made
 
 

@@ -186,46 +186,9 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     s = chirp_settings
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
-    profile = dict(zip(_PROFILE, map(float, chirp_table.profile_texts(s)), strict=True))
-    frame = (0, len(s.transmit_order) - 1, s.loops, s.frames or 0)
-    period = float(chirp_table.format_decimal(s.frame_period or 0.0, 3))
-    radio = {
-        "waveformType": "legacyFrameChirp",
-        "MIMOScheme": "TDM",
-        "rlChanCfg_t": {
-            "rxChannelEn": f"0x{chirp_table.numbers_to_bits(s.receivers):X}",
-            "txChannelEn": f"0x{chirp_table.numbers_to_bits(s.transmit_order):X}",
-            "cascading": 0,
-        },
-        "rlAdcOutCfg_t": {
-            "fmt": {
-                "b2AdcBits": chirp_table.BIT_CODES[s.bits],
-                "b2AdcOutFmt": 0 if s.real else 1,
-                "b8FullScaleReducFctr": 0,
-            }
-        },
-        "rlProfiles": [{"rlProfileCfg_t": profile | {"profileId": 0, "numAdcSamples": s.samples}}],
-        "rlChirps": [
-            {
-                "rlChirpCfg_t": {
-                    "chirpStartIdx": index,
-                    "chirpEndIdx": index,
-                    "profileId": 0,
-                    **dict.fromkeys(_VARIATIONS, 0.0),
-                    "txEnable": f"0x{chirp_table.numbers_to_bits([tx]):X}",
-                }
-            }
-            for index, tx in enumerate(s.transmit_order)
-        ],
-        "rlFrameCfg_t": dict(zip(_FRAME, (*frame, period), strict=True)),
-    }
-    record = {
-        "rlDevDataFmtCfg_t": {"iqSwapSel": int(s.swap_iq), "chInterleave": int(s.lanes == 2)},
-        "rlDevLaneEnable_t": {"laneEn": f"0x{2**s.lanes - 1:X}"},
-    }
-    device = {"mmWaveDeviceId": 0, "rfConfig": radio, "rawDataCaptureConfig": record}
+    text = chirp_table.fill_file("studio", s, "#x", ",\n", lane_mask=hex(2**s.lanes - 1))
     with replace_file(path) as part:
-        part.write_text(json.dumps({"mmWaveDevices": [device]}, indent=2) + "\n", encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
 
 
 def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str | Path]) -> None:

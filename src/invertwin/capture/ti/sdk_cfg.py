@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from invertwin.capture.chirps import ChirpSettings
-from invertwin.capture.ti import chirp_table
+from invertwin.capture.ti import chirp_table, device_limits
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import read_text, safe_reader
@@ -17,7 +17,6 @@ from invertwin.storage.untrusted import read_text, safe_reader
 _ARGUMENTS = chirp_table.FIELDS["arguments"]
 _IGNORED = {name for names in chirp_table.FIELDS["ignored"].values() for name in names}
 _UNIQUE_COMMANDS = ("channelCfg", "adcCfg", "frameCfg")
-_BAND_EDGE = 70e9  # Hz, between the devices of 60 and 77 GHz
 # Places of the numbers of a profile in its command.
 _PROFILE = (1, 2, 3, 4, 7, 9, 10)
 _ONES = ["1", "0"] * 4  # factors of a device's receivers
@@ -158,40 +157,28 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
     return read
 
 
-def write_cfg(path: str | Path, chirp_settings: ChirpSettings) -> None:
+def write_cfg(path: str | Path, chirp_settings: ChirpSettings, device: str = "") -> None:
     """Write what `read_cfg` reads. What the settings do not hold is written as in TI's demos.
+
+    Warns (`PhysicsWarning`) of what the device cannot do; `fields.toml` has its limits.
 
     Args:
         path: file to write.
         chirp_settings: settings to write.
+        device: name of the board, such as xWR1642; none = one of the lanes and the band.
 
     Raises:
         InputError: the folder does not exist.
     """
     s = chirp_settings
-    devices = {2: "xWR68xx" if s.start_frequency < _BAND_EDGE else "xWR18xx", 4: "xWR1443"}
-    start, idle, adc, end, slope, samples, rate = chirp_table.profile_texts(s)
-    receivers = chirp_table.numbers_to_bits(s.receivers)
+    family = device_limits.recording_family(s, device)
+    if excess := device_limits.describe_excess(s, family):
+        message = f"no xWR{family}xx records the settings of {Path(path).name}: "
+        warnings.warn(message + "; ".join(excess), PhysicsWarning, stacklevel=2)
     factors = s.channel_factors or [_ONES] * max(3, *s.transmit_order)
-    calibration = [s.range_bias, *np.ravel(factors).astype(float)]
-    lines = [
-        *([f"% Platform:{devices[s.lanes]}"] if s.lanes else []),
-        "sensorStop",
-        "flushCfg",
-        "dfeDataOutputMode 1",
-        f"channelCfg {receivers} {chirp_table.numbers_to_bits(s.transmit_order)} 0",
-        f"adcCfg {chirp_table.BIT_CODES[s.bits]} {int(not s.real)}",
-        f"adcbufCfg -1 {int(s.real)} {int(s.swap_iq)} {int(s.lanes != 4)} 1",
-        f"profileCfg 0 {start} {idle} {adc} {end} 0 0 {slope} 0 {samples} {rate} 0 0 30",
-        *(
-            f"chirpCfg {i} {i} 0 0 0 0 0 {chirp_table.numbers_to_bits([tx])}"
-            for i, tx in enumerate(s.transmit_order)
-        ),
-        f"frameCfg 0 {len(s.transmit_order) - 1} {s.loops} {s.frames or 0} "
-        f"{chirp_table.format_decimal(s.frame_period or 0, 3)} 1 0",
-        "lvdsStreamCfg -1 0 1 0",
-        f"compRangeBiasAndRxChanPhase {' '.join(map(chirp_table.format_decimal, calibration))}",
-        "sensorStart",
-    ]
+    numbers = [s.range_bias, *np.ravel(factors).astype(float)]
+    calibration = " ".join(map(chirp_table.format_decimal, numbers))
+    text = chirp_table.fill_file("cfg", s, "d", "\n", calibration=calibration)
+    named = f"% Platform:xWR{family}xx\n" if s.lanes else ""
     with replace_file(path) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        part.write_text(named + text, encoding="utf-8")

@@ -126,6 +126,7 @@ def _simulate_moving_frames(
     return beat, metrics, plotting.range_doppler(maps), "doppler", first
 
 
+_IDLE_TIME = 13e-6  # s, of single ramps: with the ADC start time that a board takes from it
 # A largest sample at this part of the full scale leaves room for those of other seeds.
 _FULL_SCALE_MARGIN = 1.25
 
@@ -144,7 +145,7 @@ def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
         )
     raw = run.raw or RawTable()
     ramp = raw.adc_start_time + radar.waveform.duration
-    idle = 0.0
+    idle = _IDLE_TIME
     if run.chirps is not None:
         if not run.chirps.tdm:
             raise InputError(
@@ -159,7 +160,7 @@ def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
             )
     board = None if run.radar is None else run.radar.board
     with prefix_errors("raw"):
-        return make_settings(
+        settings = make_settings(
             radar.waveform,
             (board and board.transmitters) or len(radar.transmitters.positions),
             (board and board.receivers) or len(radar.receivers.positions),
@@ -169,6 +170,11 @@ def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
             idle_time=round(max(idle, 0.0), 9),
             **raw.model_dump(exclude={"full_scale"}),
         )
+        return ti.add_demo_times(settings, _board_name(run)) if run.raw else settings
+
+
+def _board_name(run: RunFile) -> str:
+    return (run.radar and run.radar.board and run.radar.board.name) or ""
 
 
 def write_raw_files(
@@ -192,7 +198,7 @@ def write_raw_files(
         data = adc_counts(beat, settings, full_scale)
         samples = folder.file("raw/capture.bin")
         ti.write_samples(samples, data)
-        ti.write_cfg(folder.file("raw/capture.cfg"), settings)
+        ti.write_cfg(folder.file("raw/capture.cfg"), settings, _board_name(run))
         studio = folder.file("raw/capture.mmwave.json")
         ti.write_studio(studio, settings)
         ti.write_setup(folder.file("raw/capture.setup.json"), studio, [samples])

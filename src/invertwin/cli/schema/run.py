@@ -98,9 +98,13 @@ class RawTable(Section):
         None,
     )
     adc_start_time: NonNegative = key(
-        "s, from the start of the ramp to the first sample; the waveform is what is sampled", 0.0
+        "s, from the start of the ramp to the first sample; the waveform is what is sampled; 0 = "
+        "up to 6 µs of the idle time",
+        0.0,
     )
-    frame_period: Positive | None = key("s, from frame to frame, as the settings say it", None)
+    frame_period: Positive | None = key(
+        "s, from frame to frame; without it the shortest that holds the chirps", None
+    )
 
 
 class ObservationTable(Section):
