@@ -120,7 +120,12 @@ def test_two_workers_make_the_same_bytes(whole, monkeypatch, capsys):
     metrics = read_metrics(out)
     assert (metrics["dataset_samples"], metrics["shards"]) == (5, 3)
     assert metrics["dataset_bytes"] == sum(map(len, shards(out).values()))
-    assert "report.html" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert metrics["answer"] == "5 samples (beat, map, masks) in 3 shards"
+    assert metrics["answer"] in said
+    assert "report.html" in said
+    page = (out / "report.html").read_text()
+    assert page.index("The first sample") < page.index("samples per second")
 
 
 def test_a_shard_does_not_depend_on_what_was_made_before(whole):

@@ -132,7 +132,7 @@ def dataset(options: command_options.DatasetOptions, file: command_options.FileA
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         with prefix_file_errors(file), show_progress(command_options.console):
             workers = options.workers or available_threads()
-            return command.run_dataset(runs[file.stem], folder, part, options.engine, workers), ""
+            return command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
 
     run_in_folder(chosen, Path("out"), work, runs)
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from invertwin import __version__
+from invertwin import __version__, plotting
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.inputs import DATASET_SECTIONS
-from invertwin.cli.report import ReportTable, quantity_table, write_report
+from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
@@ -113,8 +113,8 @@ def parse_part(text: str | None) -> tuple[int, int]:
 
 def run_dataset(
     run: RunFile, folder: RunFolder, part: tuple[int, int], engine: Engine, workers: int
-) -> list[ReportTable]:
-    """Simulate the shards of a part that are not there yet; return the tables to print.
+) -> tuple[list[ReportTable], str]:
+    """Simulate the shards of a part that are not there yet; return tables and a sentence to print.
 
     Args:
         run: The run file of the data set.
@@ -152,17 +152,20 @@ def run_dataset(
     manifest = shards.DatasetManifest(**content)
     folder.write_text(shards.MANIFEST, manifest.model_dump_json(indent=1) + "\n")
     count, seconds = sum(shard.samples for shard in rows), time.perf_counter() - begin
+    answer = f"{count} samples ({', '.join(content['arrays'])}) in {len(rows)} shards"
     metrics = {
         "task": "dataset",
+        "answer": answer,
         "dataset_samples": count,
         "shards": len(rows),
         "dataset_bytes": sum(shard.size for shard in rows),
         "samples_per_second": sum(made for _, _, made in missing) / seconds,
         "wall_seconds": seconds,
     }
-    status = f"{count} samples in {len(rows)} shards."
-    parts, title = [quantity_table("Data set", metrics)], run.title or "Data set"
-    return write_report(folder, metrics, title, status, parts, again="dataset", note=run.note)
+    view = save_picture(folder, "scene", plotting.scene(scene, sensor.radar), "The first sample")
+    parts, title = [view, quantity_table("Data set", metrics)], run.title or "Data set"
+    said, note = f"{answer}.", run.note
+    return write_report(folder, metrics, title, said, parts, again="dataset", note=note), answer
 
 
 def make_shard(job: tuple[str, int, int]) -> bytes:
@@ -265,8 +268,7 @@ def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
         "paths_first": info(dims=["path", "xyz"], unit="m"),
         "paths_last": info(dims=["path", "xyz"], unit="m"),
     }
-    held = {_ARRAY_NAMES[name] for name in table.signals}
-    held |= {"masks"} if table.masks else set()
+    held = {_ARRAY_NAMES[name] for name in table.signals} | ({"masks"} if table.masks else set())
     return {n: a for n, a in known.items() if n in held or (table.paths and "paths_" in n)}
 
 

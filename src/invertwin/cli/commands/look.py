@@ -87,16 +87,15 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         for suffix in ("ply", "pcd"):
             radars.save_points(folder.file(f"points.{suffix}"), points)
     title, note = options.recording.name, load_texts("notes")["look"]
-    tables = [quantity_table(title, metrics), *warning_tables(said)]
     kind = "directions" if chirps is None else "doppler"
     view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", kind)
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
     again = options.command("look", folder.path)
-    parts = [*tables, view]
+    parts = [view, quantity_table(title, metrics), *warning_tables(said)]
     if grid.u_count > 1 and points is not None and len(points):
         maps, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
         above = plotting.from_above(maps, grid, one, {"detections": points.position})
-        parts.append(save_picture(folder, "above", above, "From above", "above"))
+        parts.insert(1, save_picture(folder, "above", above, "From above", "above"))
     return write_report(folder, metrics, title, status, parts, again=again, note=note), answer
 
 

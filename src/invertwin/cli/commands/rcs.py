@@ -60,7 +60,7 @@ def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> tuple[list[ReportTab
         told = f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA"
         warnings.warn(told, UserWarning, stacklevel=2)
         status += f" Skipped a comparison: {missing}."
-    parts = [*_make_tables(scenes), *pictures]
+    parts = [*pictures[:1], *_make_tables(scenes), *pictures[1:]]
     return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs"), answer
 
 
