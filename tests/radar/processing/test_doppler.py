@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from invertwin.channel import Sampling
 from invertwin.errors import InputError
 from invertwin.radar import (
     FMCW,
@@ -18,13 +19,26 @@ from invertwin.radar import (
     moving_beat,
     range_doppler,
     range_doppler_angle,
+    range_profile,
     resolve_fold,
     velocity_axis,
     velocity_span,
 )
 from invertwin.radar.boards import BOARDS
+from invertwin.scene import (
+    MovingScene,
+    Object,
+    RoughDielectric,
+    Scene,
+    Walking,
+    person,
+    rigid,
+    sphere,
+    standing_height,
+)
 from invertwin.scene.antenna import linear_array
 from invertwin.scene.pose import rotation_from_vector
+from invertwin.simulation import simulate_chirps
 from oracles.moving_point import moving_point
 
 WAVE = FMCW(76.5e9, 1e9, 40e-6, 64)
@@ -202,6 +216,77 @@ def test_spectrogram_follows_a_swinging_point():
     expected = 0.02 * 2 * math.pi * 5 * torch.cos(2 * math.pi * 5 * result.times)
     assert (ridge - expected).abs().max() < 1.5 * (result.velocities[1] - result.velocities[0])
     assert result.power.max() == pytest.approx(0.25, rel=0.1)
+
+
+def slow_time(beat: torch.Tensor, radar: Radar, chirps: Chirps, far: float) -> torch.Tensor:
+    """Range profile of every chirp of one channel [range, chirp]."""
+    every = radar.frames([0] * chirps.count)
+    return range_profile(beat[0], every, radar.grid(1.0, far))[:, 0, 0].T
+
+
+def test_a_rotor_has_the_range_rates_of_its_path():
+    """A ball on an arm of 0.1 m turns twice a second: range rates of d|p|/dt, up to 1.25 m/s.
+
+    Of every fourth chirp they are the same modulo the span of 1.2 m/s.
+    """
+    radar = mimo(1, 1)
+    arm, turns, middle = 0.1, 2 * math.pi * 2, 2.0
+    ball = Object(sphere(0.04, 2), RoughDielectric(4.0))
+
+    def rotor(time: float) -> Scene:
+        x, y = arm * math.sin(turns * time), arm * math.cos(turns * time)
+        return Scene({"ball": replace(ball, pose=rigid(translation=[middle + x, y, 0.0]))})
+
+    chirps = Chirps(512, 0.4e-3)
+    few = Sampling(depth=1, points_per_m2=1000.0)
+    beat = simulate_chirps(rotor, radar, chirps, seed=1, sampling=few, visibility_every=128)
+    for beats, train, length in (
+        (beat, chirps, 32),
+        (beat[:, ::4], Chirps(128, 1.6e-3), 8),
+    ):
+        found = micro_doppler(
+            slow_time(beats, radar, train, 3.0), radar, train, length=length, step=length // 4
+        )
+        ridge = found.velocities[found.power.sum(0).argmax(-1)]
+        x, y = (arm * f(turns * found.times) for f in (torch.sin, torch.cos))
+        rate = (middle * turns * y) / torch.hypot(middle + x, y)
+        span = velocity_span(radar, train)
+        off = (ridge - rate + span / 2) % span - span / 2
+        assert off.abs().max() < 1.5 * (found.velocities[1] - found.velocities[0])
+    assert rate.abs().max() == pytest.approx(turns * arm, rel=0.01)
+    assert span == pytest.approx(1.2, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_walker_has_the_range_rates_of_trunk_and_limbs():
+    """The brightest range rate is that of the walk, the fastest that of the fastest point."""
+    wave = FMCW(77e9, 0.5e9, 30e-6, 64)
+    radar = replace(mimo(1, 1), waveform=wave, positions=torch.tensor([[0.0, 0.0, 1.0]]).double())
+    body, speed = person(spacing=0.05), 1.0
+    place = rigid(translation=[5.0, 0.0, standing_height(body)])
+    scene = Scene({"person": Object(body.mesh({}), RoughDielectric(8.0), place)})
+    walk = MovingScene(scene, {"person": Walking(body, speed=speed)})
+    chirps = Chirps(2048, 0.25e-3)
+    few = Sampling(depth=1, points_per_m2=300.0)
+    beat = simulate_chirps(walk, radar, chirps, seed=1, sampling=few, visibility_every=128)
+    slow = slow_time(beat, radar, chirps, 6.0)
+    found = micro_doppler(slow, radar, chirps, length=256, step=64)
+    power = found.power.sum(0)
+    bin_width = float(found.velocities[1] - found.velocities[0])
+    trunk = float(found.velocities[power.mean(0).argmax()])
+    assert trunk == pytest.approx(-speed, abs=0.3)
+
+    def ranges(time: float) -> torch.Tensor:
+        return (walk(time)["person"].vertices - radar.positions).norm(dim=1)
+
+    step = 1e-3
+    rates = [(ranges(t + step) - ranges(t)) / step for t in found.times.tolist()]
+    fastest = float(torch.stack(rates).min())
+    levels = power.amax(0) / power.max()
+    seen = float(found.velocities[levels > 1e-3].min())
+    # A Hann window spreads a range rate over two bins on either side.
+    assert fastest - 3 * bin_width < seen < 0.8 * fastest
+    assert fastest < -2.0
 
 
 def test_gradients():
