@@ -123,6 +123,13 @@ def test_a_single_motion_needs_no_list():
     assert one.scene["person"].motion == listed.scene["person"].motion
 
 
+def test_walking_needs_no_speed():
+    usual, said = (
+        read(person={"motion": [{"kind": "walking"} | more]}) for more in ({}, {"speed": 1.4})
+    )
+    assert usual.scene["person"].motion == said.scene["person"].motion
+
+
 def test_a_person_can_wave_while_walking():
     both = [{"kind": "walking", "speed": 1.2}, {"kind": "waving", "side": "left"}]
     run = read(person={"motion": both})

@@ -78,7 +78,7 @@ class Walking(PersonMotion):
 
     Attributes:
         body: body template with the joints of ``person``.
-        speed: mean speed [m/s].
+        speed: mean speed [m/s]; 1.4 is usual.
         phase: phase of the cycle at time 0, in cycles; 0: the right foot lands.
         on_spot: whether to stay in place, for example on a ``TrajectoryMotion`` of that speed.
 
@@ -88,7 +88,7 @@ class Walking(PersonMotion):
     """
 
     body: BodyTemplate
-    speed: Positive
+    speed: Positive = 1.4
     phase: float = 0.0
     on_spot: bool = False
 
