@@ -11,7 +11,12 @@ _PAUSE = FIELDS["limits"]["pause after the chirps of a frame [ms]"]
 
 
 def recording_family(chirp_settings: ChirpSettings, device: str = "") -> str:
-    """First two digits of the device, or of one with the lanes and the band of the settings."""
+    """First two digits of the device, or of one with the lanes and the band of the settings.
+
+    Args:
+        chirp_settings: of a recording.
+        device: name of a board; none = not known.
+    """
     near = "68" if chirp_settings.start_frequency < _BAND_EDGE else "18"
     return device_family(device) or ("14" if chirp_settings.lanes == 4 else near)
 
