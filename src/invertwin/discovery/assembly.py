@@ -14,8 +14,10 @@ from invertwin.discovery.imaging.reflectivity import thin_map
 from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
+from invertwin.inversion.callbacks import Report
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
+from invertwin.runtime.progress import track
 from invertwin.scene import Scene
 
 _LEARNING_RATE = 0.01  # learning rate in the parameter scales of ``PrimitiveModel``
@@ -147,14 +149,15 @@ class ShapeLikelihood:
             shapes: initial shape parameters.
             steps: number of steps.
         """
-        unknowns = self.unknowns(shapes)
         scene, adam = self.build_scene(shapes), Optimizer("adam", rate=_LEARNING_RATE)
-        seen = Observation(self.model, self.power, sensor=self.radar)
-        plan = Schedule(steps, annealing=0.5)
+        free, data = self.unknowns(shapes), Observation(self.model, self.power, sensor=self.radar)
+        plan, loss, seed = Schedule(steps, annealing=0.5), self.loss, self.seed
+        done = track(range(steps + 1), f"steps of a fit of {len(shapes)} objects")
+        told = [Report(lambda _: next(done, None))]
         found = reconstruct(
-            scene, seen, unknowns, loss=self.loss, optimizer=adam, schedule=plan, seed=self.seed
+            scene, data, free, loss=loss, optimizer=adam, schedule=plan, seed=seed, callbacks=told
         )
-        return [one.shape for one in unknowns.values()], found
+        return [one.shape for one in free.values()], found
 
 
 def make_sampling(frames: int, rays: int) -> Sampling:

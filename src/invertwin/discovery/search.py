@@ -121,16 +121,13 @@ class ShapeSearch:
 
     def run(self) -> list[ShapeParameters]:
         """Run the search and return the shapes."""
-        shapes, before = list[ShapeParameters](), 0
+        shapes = list[ShapeParameters]()
         for _ in range(_BIRTH_ROUNDS):
-            born = self.propose_births(shapes)
+            born, before = self.propose_births(shapes), len(shapes)
             if not born:
                 break
-            shapes = self.merge_shapes(self.refine([*shapes, *born]))
-            survivors = self.prune(shapes)
-            stalled = len(survivors) <= before
-            before, shapes = len(survivors), survivors
-            if stalled:
+            shapes = self.prune(self.merge_shapes(self.refine([*shapes, *born])))
+            if len(shapes) <= before:
                 break
         if not shapes:
             return []

@@ -32,7 +32,7 @@ class Report(Callback):
         function: receives the row: ``step``, ``stage``, ``loss``, ``values``.
     """
 
-    function: Callable[[dict[str, Any]], None]
+    function: Callable[[dict[str, Any]], object]
 
     def step(self, fit: Fit, row: dict[str, Any]) -> None:
         """Report a row."""
