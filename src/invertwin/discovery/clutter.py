@@ -54,8 +54,7 @@ def reconstruct_among_clutter(
         schedule: schedule of each fit, or its stages; all frames in every step.
         seed: seed of all random numbers.
         callbacks: observers of each fit, given its number: 0 and 1, 2 and 3 with permittivities.
-        always: False = only if a fit without clutter is inconsistent with the data; the better of
-            the two results is returned, see ``choose_result``.
+        always: False = only if a fit without is inconsistent; the better one is returned.
         options: further options of ``reconstruct``.
 
     Raises:
