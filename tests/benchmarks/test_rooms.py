@@ -108,3 +108,26 @@ def test_a_corner_beside_a_box_is_a_corner(rooms):
         ("corner", "corner"),
     ]
     assert max(pair["error"] for pair in row["matched"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*unambiguous range:invertwin.errors.PhysicsWarning")
+def test_walls_enclose_the_radar_and_show_things_again(rooms):
+    drawn = rooms.Room.draw(2, has_walls=True)
+    assert drawn.things == rooms.Room.draw(2).things
+    assert min(drawn.span[:2]) / 2 > rooms.AWAY
+    ball = rooms.Thing("sphere", (0.0, 0.0), 0.0, (0.4, 0.4, 0.4), 0.6, 5.0)
+    span = 7.0, 7.0, 2.6
+    room, free = (rooms.Room(0, (ball,), (0.0,), 60.0, walls) for walls in (span, None))
+    ends = {name: item.vertices.abs().amax(0).tolist() for name, item in room.walls().items()}
+    assert ends["far_x"] == pytest.approx([3.5, 3.5, 2.6])
+    assert ends["near_y"] == pytest.approx([3.5, 3.5, 2.6])
+    assert ends["ceiling"] == pytest.approx([3.5, 3.5, 2.6])
+    assert ends["floor"] == pytest.approx([3.5, 3.5, 0.0])
+    grid = room.radar().grid(0.5, 6.0)
+    closed, alone = (one.capture().spectrum(grid).sum((0, 2, 3)) for one in (room, free))
+    # The floor lies 0.6 m below the radar and the ball: √(3.2² + 1.2²) m by it, on one leg or both.
+    ghosts = (grid.ranges > 3.25) & (grid.ranges < 3.5)
+    before = (grid.ranges > 2.9) & (grid.ranges < 3.1)
+    assert float(closed[ghosts].sum()) > 10 * float(alone[ghosts].sum())
+    assert float(closed[before].sum()) == pytest.approx(float(alone[before].sum()), rel=0.3)
