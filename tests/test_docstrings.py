@@ -85,12 +85,48 @@ def missing(module: ModuleType) -> list[str]:
     return [f"{module.__name__}.{name}: {', '.join(names)}" for name, names in found if names]
 
 
+def stale_references(module: ModuleType) -> list[str]:
+    """Members of the package's classes that docstrings of a module name and that do not exist."""
+    found: list[str] = []
+    for name, text in re.findall(
+        r"``(?:\w+\.)*([A-Z]\w+\.\w+)(\(\))?``", inspect.getsource(module)
+    ):
+        owner, member = name.split(".")
+        kinds = CLASSES.get(owner, [])
+        if kinds and not any(has_member(kind, member) for kind in kinds):
+            found.append(f"{module.__name__}: {name}{text}")
+    return found
+
+
+def has_member(owner: type, name: str) -> bool:
+    """Whether a class has an attribute, a field, or sets one in a method."""
+    annotated = any(name in vars(base).get("__annotations__", ()) for base in owner.__mro__)
+    own = [base for base in owner.__mro__ if base.__module__.startswith("invertwin")]
+    return (
+        hasattr(owner, name)
+        or annotated
+        or any(f"self.{name}" in inspect.getsource(base) for base in own)
+    )
+
+
 MODULES = [
     module.name
     for package in (invertwin, invertwin_studies)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if not re.search(r"\._|^invertwin\.cli\b|\.commands$", module.name)
 ]
+
+
+CLASSES: dict[str, list[type]] = {}
+for _module in map(importlib.import_module, MODULES):
+    for _name, _value in vars(_module).items():
+        if isinstance(_value, type) and _value.__module__ == _module.__name__:
+            CLASSES.setdefault(_name, []).append(_value)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_docstrings_name_members_that_exist(name):
+    assert stale_references(importlib.import_module(name)) == []
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -118,3 +154,12 @@ def test_a_name_that_is_left_out_is_found():
         other: int = 0
 
     assert list(missing_of_class(Value)) == [("fields", ["other"])]
+
+
+def test_a_member_that_does_not_exist_is_found():
+    module = ModuleType("somewhere")
+    text = "Text of ``Chirps.interval``, ``iw.Chirps.max_speed()``, and ``Chirps.pace``."
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inspect, "getsource", lambda _: text)
+        patch.setattr(f"{__name__}.has_member", lambda _, name: name in ("interval", "max_speed"))
+        assert stale_references(module) == ["somewhere: Chirps.pace"]

@@ -251,7 +251,7 @@ class MapPlane(Cells):
         return Mesh(torch.stack([a, a + u, a + u + v, a + v]), _TRIANGLES)
 
     def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
-        """One point at random in each square of a finer grid. See ``Cells.drawn``."""
+        """One random point in each square of a finer grid. See ``Cells.sample_points``."""
         side = self.sampling.points_per_side
         lattice = [side * n for n in self.count]
         jitter = torch.from_numpy(rng.random((2, *lattice)))
@@ -261,7 +261,7 @@ class MapPlane(Cells):
         return points.transpose(1, 2).reshape(-1, side * side, 3)
 
     def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
-        """Cells that hold points of the plane. See ``Cells.cell_of``."""
+        """Cells that hold points of the plane. See ``Cells.find_cells``."""
         offset, n = points - self.corner, self._normal
         n = n / n.square().sum()
         i = (torch.linalg.cross(offset, self.second.expand_as(offset)) @ n * self.count[0]).floor()
@@ -321,7 +321,7 @@ class MapMesh(Cells):
         return self.mesh
 
     def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
-        """One point at random in each of equal parts of the triangles. See ``Cells.drawn``."""
+        """One random point in each of equal parts of triangles. See ``Cells.sample_points``."""
         side, cells = self.sampling.points_per_side, len(self.mesh.faces)
         jitter = torch.from_numpy(rng.random((2, cells, side, side)))
         steps = torch.arange(side, dtype=torch.float64)
@@ -332,7 +332,7 @@ class MapMesh(Cells):
         return a + far * (b - a + across * (c - b))
 
     def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
-        """The triangles. See ``Cells.cell_of``."""
+        """The triangles. See ``Cells.find_cells``."""
         return faces
 
 

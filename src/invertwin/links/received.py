@@ -249,7 +249,7 @@ class PropagationSettings:
 
 
 def delay_spread_from_moments(moments: Float64[Tensor, "*link 3"]) -> Float64[Tensor, "*link"]:
-    """Root mean square spread of delays [s], of sums of ``PropagationSettings.moments``.
+    """Root mean square spread of delays [s], of sums of ``PropagationSettings.path_moments``.
 
     Args:
         moments: Power, and its first and second moment over excess delay.

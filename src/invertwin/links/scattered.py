@@ -1,8 +1,8 @@
 """Incoherent scattering by rough surfaces from transmitters to receivers.
 
-Mirrored paths hold what smooth surfaces keep together (``trace_paths``). What they lose by their
-roughness goes everywhere, by ``Material.incoherent``: the lobes of ``EffectiveRoughness``, of which
-the one about the mirror direction has what heights take off the mirror.
+Specular paths carry the coherent power (``trace_paths``). The power that roughness takes from them
+is scattered by ``Material.incoherent_law``: the lobes of ``EffectiveRoughness``, of which the one
+about the specular direction has the power lost to variations of height.
 
 Two kinds of paths add up: those that scatter at each of their bounces (``deposit_power``), and
 those that scatter once, with specular reflections before or after (``trace_single_scattering``).

@@ -201,7 +201,7 @@ class RadioMap(ForwardModel):
         return self.realisations_about(self.predict(scene, sensor, seed))
 
     def realisations_about(self, mean: Float64[Tensor, "tx *map"]) -> Realisations:
-        """A map with other errors of measurement each time, see ``ForwardModel.looks``.
+        """A map with other errors of measurement each time, see ``ForwardModel.realisations``.
 
         Args:
             mean: The map without errors.

@@ -178,7 +178,7 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     ones hold more power than the twin explains, blue ones less.
 
     Args:
-        residual: Of coarse bins, see ``LlvmProbeResult.residuals``.
+        residual: Residuals of coarse bins, see ``Verdict.residuals``.
         grid: Bins of the fitted map.
         marked: Standard deviations.
     """
