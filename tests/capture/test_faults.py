@@ -73,7 +73,7 @@ def test_complex_by_type(turn):
     samples = ECHOES.real * torch.polar(torch.tensor(1.0).double(), torch.tensor(turn).double())
     (found,) = find_faults(ChirpCapture(samples, RADAR, CHIRPS))
     assert found.name == "complex only by type"
-    assert "agree to 1 (coherence" in found.evidence
+    assert "have a coherence of 1 (1 = real" in found.evidence
     assert names(ECHOES.real + 0.5j * ECHOES.imag) == ["ghosts"]
 
 

@@ -354,7 +354,7 @@ def test_nothing_moves_in_noise(recording, monkeypatch, capsys):
     assert found["moves"] is False
     assert "mover_range_m" not in found
     assert found["peak_range_m"] == pytest.approx(3.0, abs=0.06)
-    assert "something moves" in capsys.readouterr().out
+    assert "moving target, above noise and drift" in capsys.readouterr().out
 
 
 def test_faults_are_warned_of(recording, monkeypatch, capsys):

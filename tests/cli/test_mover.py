@@ -90,7 +90,7 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
     [
         (
             ('kind = "mover"', 'kind = "translation"'),
-            "data: expected one chirp of a recording with movers, got the mean",
+            "data: expected one chirp of a recording of moving targets, got the mean",
         ),
         (
             ("[optimizer]", '[calibration]\nobject = "mover"\n[optimizer]'),
@@ -98,7 +98,7 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
         ),
         (
             ("[optimizer]", f"{SCALE}\n[optimizer]"),
-            "parameters: expected a mover alone, got mover, sc",
+            "parameters: expected kind mover alone, got mover, sc",
         ),
         (('folder = "openradar"', 'folder = "elsewhere"'), "github.com/PreSenseRadar/OpenRadar"),
         (('folder = "openradar"', 'folder = "openradar"\nboard = { name = "xWR1443" }'), "board"),

@@ -122,7 +122,7 @@ def radar(**changes):
         ),
         (
             run(gradcheck={"parameter": MOVER, "tangent": {"place": 1.0}, "step": 1e-3}),
-            ["gradcheck: ", "got a mover", "choose another kind"],
+            ["gradcheck: ", "got kind mover", "choose another"],
         ),
         (
             run(reconstruct={"steps": 3, "depth": 0}),

@@ -208,17 +208,17 @@ def test_a_start_that_is_lost_says_so_in_the_table(tmp_path):
     ]
     metrics = {"steps": 9, "status": "converged", "verdict": "unknown", "parameters": {}}
     starts = make_tables(fits_that_end(problem, rows, problem.scene), metrics)[2]
-    ended = starts.columns.index("ended as")
+    ended = starts.columns.index("status")
     assert [row[ended] for row in starts.rows] == [
         "the loss no longer falls",
-        "lost: shows nothing of the data",
+        "lost: predicts none of the data",
     ]
 
 
 def test_labels_tell_whose_a_measure_is():
     assert is_shape_key("true_components")
     assert shape_label("components") == "separate parts"
-    assert shape_label("start_iou") == "shared over joint volume, start"
+    assert shape_label("start_iou") == "intersection over union of volumes, start"
     assert not is_shape_key("start_loss_sharp")
 
 

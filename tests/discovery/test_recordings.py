@@ -154,7 +154,7 @@ def test_echoes_that_no_shape_explains_are_listed_as_points(monkeypatch):
     monkeypatch.setattr(ShapeSearch, "fit_spheres", lambda self, places: [])
     found = twin(Capture.from_beat(echo + 1e-2 * noise, radar))
     assert found.scene is None
-    assert found.notes[0].startswith("no shape explains the maps")
+    assert found.notes[0].startswith("no shape fits the maps")
     assert [one.kind for one in found.objects] == ["point"]
     off = found.objects[0].position - radar.positions[0]
     assert float(off.norm()) == pytest.approx(1.5, abs=0.03)

@@ -27,8 +27,8 @@ def test_every_fit_is_a_line_and_every_way_a_colour():
     (shade,) = axes.patches
     assert shade.get_extents().transformed(axes.transData.inverted()).width == pytest.approx(1.0)
     assert legend(axes) == [
-        *("full (2)", "interior (1)", "extra width shrinks to 0: losses not comparable"),
-        "start, without extra width",
+        *("full (2)", "interior (1)", "blur is reduced to 0: losses not comparable"),
+        "start, without blur",
     ]
 
 

@@ -129,14 +129,14 @@ class ChirpCapture:
             chirp: "mean", or the number from 0 of the chirp to take.
 
         Raises:
-            InputError: A chirp that does not exist, or the mean of a recording of movers.
+            InputError: A chirp that does not exist, or the mean of a recording of moving targets.
         """
         count = self.chirps.count
         if chirp == "mean":
             if self.moving:
                 raise InputError(
-                    "expected one chirp of a recording with movers, got the mean, in which they "
-                    "fade; choose one `chirp`, or fit a parameter of kind mover"
+                    "expected one chirp of a recording of moving targets, got the mean, in which "
+                    "they fade; choose one `chirp`, or fit a parameter of kind mover"
                 )
             beat = self.beat.mean(dim=1)
         elif isinstance(chirp, bool) or not isinstance(chirp, int) or not 0 <= chirp < count:

@@ -137,7 +137,7 @@ def _find_rivals(
         if share > _RIVAL_SHARE:
             place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
             yield (
-                f"echoes that the scene does not explain have {min(share, 999.0):.2g} times the "
+                f"unmodelled echoes have {min(share, 999.0):.2g} times the "
                 f"power of the fitted objects, strongest at ({place}) m: they may be parts of these"
             )
 

@@ -1,6 +1,6 @@
-"""The twin of a mover: its echo is found in range, range rate and direction, then fitted there.
+"""Detection and fit of a moving target in range, range rate and direction.
 
-Its unknowns are those of a rigid body that moves along a straight line.
+The unknowns are those of a rigid body that moves along a straight line.
 """
 
 from collections.abc import Sequence

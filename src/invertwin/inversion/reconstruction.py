@@ -1,4 +1,4 @@
-"""Reconstruction: find the scene parameters that explain observations of one or several sensors."""
+"""Reconstruction: estimate scene parameters from observations of one or several sensors."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -52,7 +52,7 @@ class Reconstruction:
 
     @cached_property
     def is_uninformative(self) -> bool:
-        """True if the twin explains next to none of the observed power, as in ``judge_fit``.
+        """True if the twin predicts almost none of the observed power, as in ``judge_fit``.
 
         A fitted gain of zero has no gradient, so such a fit stays at its start.
         """

@@ -31,8 +31,8 @@ def convergence(
     Args:
         losses: Losses of one fit; or those of several fits, by name.
         errors: Pairs of step and error of every fit, by name.
-        annealed: Step from which the surrogate has no extra width.
-        before: Loss of the start without extra width.
+        annealed: Step from which the surrogate has no additional blur.
+        before: Loss of the start without additional blur.
         error_label: What the errors are, with the unit.
     """
     if not isinstance(losses, Mapping):
@@ -48,10 +48,10 @@ def convergence(
     if positive and max(positive) > 5 * min(positive):
         left.set_yscale("log")
     if annealed is not None:
-        label = "extra width shrinks to 0: losses not comparable"
+        label = "blur is reduced to 0: losses not comparable"
         left.axvspan(0, annealed, color="black", alpha=0.07, linewidth=0, label=label)
     if before is not None:
-        left.plot([0], [before], "k*", markersize=8, label="start, without extra width")
+        left.plot([0], [before], "k*", markersize=8, label="start, without blur")
     left.set(xlabel="step", ylabel="loss")
     for right in others:
         _draw_errors(right, losses, errors or {}, error_label)

@@ -93,7 +93,7 @@ def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figu
 
 
 def range_doppler(maps: DopplerMaps) -> Figure:
-    """One frame of chirps: range × range rate, and range × direction of all and of movers."""
+    """Range × range rate of one frame, and range × direction: all echoes and moving targets."""
     return panels(doppler_panels(maps))
 
 
@@ -175,7 +175,7 @@ def residuals(residual: Float[Tensor, "range u v"], grid: Grid, *, marked: float
     """Plot residuals of data from a twin, in standard deviations of its recordings.
 
     Of the direction that is not shown, the largest counts. Bins beyond ``marked`` are framed: red
-    ones hold more power than the twin explains, blue ones less.
+    ones hold more power than the twin predicts, blue ones less.
 
     Args:
         residual: Residuals of coarse bins, see ``Verdict.residuals``.

@@ -106,7 +106,7 @@ def test_a_turn_that_explains_the_data_as_well_makes_the_verdict_ambiguous():
     assert rival.score is not None
     assert rival.score < 2.33
     assert found.verdict.reasons == (
-        f"{rival.description} explains the data as well: z = {rival.score:.1f}",
+        f"{rival.description} fits the data equally well: z = {rival.score:.1f}",
     )
     # The fit itself is left as it was.
     assert torch.equal(found.result.fit.twin()["ball"].transform, before)

@@ -61,7 +61,7 @@ def test_a_wrong_minimum_is_not():
     # Where the power is that the twin does not explain.
     marked = verdict.residuals[0].flatten() > 5
     assert BINS[2::4][marked].tolist() == pytest.approx([1.4] * int(marked.sum()), abs=0.5)
-    assert "hold more power than the twin explains" in verdict.reasons[1]
+    assert "hold more power than the twin predicts" in verdict.reasons[1]
 
 
 class Dark(Blob):

@@ -55,7 +55,7 @@ def test_two_minima_that_look_alike_are_both_listed():
     assert result.scores[0] is None
     (told,) = result.ambiguities
     assert told.startswith(("ball moved by 1.5", "ball moved by 1.6"))
-    assert "explains the data nearly as well" in told
+    assert "fits the data nearly equally well" in told
 
 
 def test_a_minimum_that_the_data_tell_is_rejected():

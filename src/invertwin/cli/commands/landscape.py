@@ -38,7 +38,7 @@ def plot_landscape(problem: Problem, console: Console) -> tuple[Figure, dict[str
         exact = evaluate_exact_losses(run, line, fine, beat)
     model, loss = problem.kind.models(problem)[0], build.build_loss(run)
     smooth = {}
-    for name, share in (("first widths", 1.0), ("no extra width", 0.0)):
+    for name, share in (("initial blur", 1.0), ("no blur", 0.0)):
         seen = Observation(model.scale_blur(share), item.recording, sensor=item.sensor, loss=loss)
         with show_progress(console):
             offsets = track(wide.tolist(), f"loss landscape, {name}")

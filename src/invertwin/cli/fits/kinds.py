@@ -41,7 +41,7 @@ def build_problem(run: RunFile, console: Console) -> Problem:
     for i, parameter in enumerate(run.parameters):
         if parameter.kind == "mover" and not isinstance(kind, MovingTarget):
             raise InputError(
-                f"parameters[{i}].kind: expected a mover as the only parameter, got "
+                f"parameters[{i}].kind: expected kind mover as the only parameter, got "
                 f"{len(run.parameters)} parameters; leave only that"
             )
     # Their errors come before any work.

@@ -167,7 +167,7 @@ def _table(run: RunFile) -> MovingTargetParameter:
     table, *others = run.parameters
     if others:
         kinds = ", ".join(parameter.kind for parameter in run.parameters)
-        raise InputError(f"parameters: expected a mover alone, got {kinds}; leave only the mover")
+        raise InputError(f"parameters: expected kind mover alone, got {kinds}; leave only this one")
     return table
 
 

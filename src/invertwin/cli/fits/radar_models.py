@@ -108,7 +108,7 @@ def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> N
         if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
             at = f"observations.{name}." if name else ""
             warnings.warn(
-                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit explains "
+                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit models "
                 "echoes of other numbers of bounces than its data have; make them equal",
                 PhysicsWarning,
                 stacklevel=4,
@@ -121,7 +121,7 @@ def has_recording_per_start(run: RunFile) -> bool:
 
 
 def blur_end_step(run: RunFile) -> float | None:
-    """The step from which the surrogate has no extra widths; None if it never has, or in stages."""
+    """Step from which the surrogate has no additional blur; None if there is none, or in stages."""
     (_, own), *others = stage_runs(run)
     kernels, settings = own.surrogate, own.fit_settings
     widened = kernels.range_width > 0 or kernels.angle_width > 0
@@ -169,7 +169,7 @@ def make_display_models(problem: Problem) -> list[ForwardModel]:
 
 
 def make_unblurred_models(problem: Problem) -> list[SurrogateMap]:
-    """The smooth model of every radar without extra widths, mean over phases."""
+    """Smooth model of every radar without additional blur, mean over phases."""
     sampling, found = make_sampling(problem.run), []
     sensors = zip(make_radar_models(problem), _sensors_with_runs(problem), strict=True)
     for model, (run, item) in sensors:

@@ -270,7 +270,7 @@ def _find_other_ends(fits: Fits) -> Row:
         found = difference_score(best.result, end.result)
         if found is not None and found < REJECTION_ZSCORE:
             where = format_place(place.tolist())
-            told.append(f"a transmitter at {where} m explains the data as well: z = {found:.1f}")
+            told.append(f"a transmitter at {where} m fits the data equally well: z = {found:.1f}")
     return {"ambiguities": told} if told else {}
 
 

@@ -31,7 +31,7 @@ _INITIAL_METRICS = (
     ("distance to the truth [m]", "start_distance_m", "position_error_m"),
     ("angle to the truth [°]", "start_angle_deg", "rotation_error_deg"),
     ("size, share off the truth", "initial_scale_error", "scale_error"),
-    ("loss without extra width", "start_loss_sharp", "loss_sharp"),
+    ("loss without blur", "start_loss_sharp", "loss_sharp"),
 )
 _START_CURVE_KEY = f"start_{CURVE_KEY}"
 START_COLUMNS = load_texts("starts") | {k: f"{name} off by" for k, name in _MATERIAL_ERRORS.items()}

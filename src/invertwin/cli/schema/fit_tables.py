@@ -21,7 +21,7 @@ from invertwin.scene.scene import Object
 
 
 class SurrogateTable(ConstructorTable):
-    """Kernels of the smooth model; the extra widths anneal to zero, in cells.
+    """Kernels of the smooth model; the additional blur widths anneal to zero, in cells.
 
     A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian" or
     "dirichlet", before the first table.

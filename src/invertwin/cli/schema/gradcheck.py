@@ -59,7 +59,7 @@ class GradcheckTable(ConstructorTable):
     def _require_step(self) -> "GradcheckTable":
         if self.parameter.kind == "mover":
             raise_key_error(
-                "expected a parameter of the scene or the radar, got a mover; choose another kind"
+                "expected a parameter of the scene or the radar, got kind mover; choose another"
             )
         wanted = {"step_deg": self.changes_angle, "step": not self.changes_angle}
         check_presence(self, wanted, f"with kind = {self.parameter.kind}")

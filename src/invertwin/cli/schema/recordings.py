@@ -68,10 +68,10 @@ class ChirpRecordingTable(RecordingTable, RadarPoseTable):
     """Raw chirps of a board, made one signal per frame."""
 
     chirp: Annotated[int, Ge(0)] | None = key(
-        "number of one chirp, from 0; without it the mean over a frame, in which movers fade", None
+        "number of one chirp, from 0; default: mean over the frame, in which targets fade", None
     )
     frame: Annotated[int, Ge(0)] | None = key(
-        "number of the only frame that is used, from 0; without it all", None
+        "number of the only frame to use, from 0; default: all", None
     )
 
     def build(self, given: Any = None, /, **more: Any) -> ChirpCapture:

@@ -1,4 +1,4 @@
-"""Ambiguities of a fit: rotated poses of an object that explain the data nearly as well."""
+"""Ambiguities of a fit: rotated poses of an object that fit the data nearly equally well."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -70,7 +70,7 @@ class FitResult:
 
     @cached_property
     def gains(self) -> list[float]:
-        """Gain of every predicted map; zero if it explains next to nothing."""
+        """Gain of every predicted map; zero if it predicts almost none of the power."""
         found = []
         for loss, (predicted, observed) in zip(self.fit.objective.losses, self.maps, strict=True):
             law = loss if isinstance(loss, SpectrumLoss) else SpectrumLoss("likelihood")

@@ -18,7 +18,7 @@ VerdictWord = Literal[
 ]
 
 MIN_EXPLAINED_FRACTION = 1e-3
-"""Minimum explained fraction of the observed power; a smaller one is uninformative."""
+"""Minimum predicted fraction of the observed power; a smaller one is uninformative."""
 _INCONSISTENT_ZSCORE = 3.5  # standard deviations of the loss over realisations
 _MARKED_BIN_ZSCORE = 5.0  # standard deviations of a coarse bin
 _DEPTH_ZSCORE = 3.0  # standard deviations by which more bounces must lower the loss
@@ -34,9 +34,9 @@ class Verdict:
 
     Attributes:
         word: ``consistent``: no evidence against the twin. ``inconsistent``: the data differ from
-            realisations of the twin. ``ambiguous``: another result explains them as well. ``at a
+            realisations of the twin. ``ambiguous``: another result fits them equally well. ``at a
             bound``: a value is at the end of its range. ``worse``: the fit is worse than its start.
-            ``lost``: uninformative start; the twin explains next to none of the observed power.
+            ``lost``: uninformative start; the twin predicts almost none of the observed power.
             ``unknown``: the model has no realisations to compare with.
         excess: loss of the data above the mean loss of realisations, in their standard deviations;
             None without realisations.
@@ -70,7 +70,7 @@ def judge_fit(result: FitResult) -> Verdict:
     if min(explained) < MIN_EXPLAINED_FRACTION:
         number = explained.index(min(explained)) + 1
         shown = f"{100 * min(explained):.2g} % of the power of observation {number}"
-        return Verdict("lost", reasons=(f"the twin explains {shown}; start nearer to the truth",))
+        return Verdict("lost", reasons=(f"the twin predicts {shown}; start nearer to the truth",))
     loss, begun = float(fit.objective(result.maps)), fit.loss_at_start()
     if loss > _MAX_LOSS_RATIO * begun:
         return Verdict("worse", reasons=(f"the loss is {loss:.4g}, at the start {begun:.4g}",))
@@ -93,7 +93,7 @@ def judge_fit(result: FitResult) -> Verdict:
         return Verdict("inconsistent", excess, structure, tuple(reasons), residuals)
     others = tuple(find_ambiguities(result))
     open_ = [
-        f"{other.description} explains the data as well"
+        f"{other.description} fits the data equally well"
         + ("" if other.score is None else f": z = {other.score:.1f}")
         for other in others
         if not other.is_rejected
@@ -103,7 +103,7 @@ def judge_fit(result: FitResult) -> Verdict:
 
 
 def explained_fractions(result: FitResult) -> list[float]:
-    """Return the explained fraction of the observed power of every observation.
+    """Return the predicted fraction of the observed power of every observation.
 
     Args:
         result: result of the fit.
@@ -115,7 +115,7 @@ def explained_fractions(result: FitResult) -> list[float]:
 
 
 def _test_deeper_paths(result: FitResult, limit: float) -> Iterator[str]:
-    """Yield a sentence if one more bounce explains the data better."""
+    """Yield a sentence if one more bounce fits the data better."""
     sampling = getattr(result.fit.observations[0].model, "sampling", None)
     if isinstance(sampling, Sampling):
         depth = sampling.depth + 1
@@ -151,4 +151,4 @@ def _describe_residual(number: int, residual: Tensor, holds_fields: bool) -> Ite
         yield f"{start} {more + less} of {count} coarse bins are not those of the twin"
     elif more + less:
         bins = f"{more} of {count} coarse bins"
-        yield f"{start} {bins} hold more power than the twin explains, {less} less"
+        yield f"{start} {bins} hold more power than the twin predicts, {less} less"

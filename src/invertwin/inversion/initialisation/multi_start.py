@@ -229,8 +229,8 @@ def _compare_ends(
     )
     scores = [None, *(equivalents.difference_score(ends[0].result, end.result) for end in ends[1:])]
     texts = tuple(
-        f"{equivalents.describe_difference(ends[0].scene, end.scene, names)} explains the data "
-        f"nearly as well: z = {z:.1f}"
+        f"{equivalents.describe_difference(ends[0].scene, end.scene, names)} fits the data "
+        f"nearly equally well: z = {z:.1f}"
         for end, z in zip(ends, scores, strict=True)
         if z is not None and z < equivalents.REJECTION_ZSCORE
     )
