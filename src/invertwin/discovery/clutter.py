@@ -41,11 +41,11 @@ def reconstruct_among_clutter(
 ) -> inversion.Reconstruction:
     """Fit objects in clutter, the echoes of objects that the scene lacks.
 
-    Echoes that the scene does not explain count as background, except around the objects that are
-    fitted, see ``estimate_clutter``. A second fit, without blur, starts from the result of the
-    first, with the clutter about it. Where the result is inconsistent with the data, and the scene
-    has objects that are not fitted, both fits are made again with the permittivities of the fitted
-    ones free: an object that is too bright would turn its faces away.
+    Unmodelled echoes are added as background, except around the fitted objects, see
+    ``estimate_clutter``. A second fit, without blur, starts from the result of the first, with the
+    clutter estimated there. If the result is inconsistent with the data, and the scene has objects
+    that are not fitted, both fits are repeated with free permittivities of the fitted objects: an
+    object that is too bright would otherwise rotate its faces away from the radar.
 
     Args:
         scene: initial scene.
@@ -54,12 +54,12 @@ def reconstruct_among_clutter(
         schedule: schedule of each fit, or its stages; all frames in every step.
         seed: seed of all random numbers.
         callbacks: observers of each fit, given its number: 0 and 1, 2 and 3 with permittivities.
-        always: False = only if a fit without is inconsistent; the better one is returned.
+        always: False = only if a fit without clutter is inconsistent; the better fit is returned.
         options: further options of ``reconstruct``.
 
     Raises:
-        InputError: as ``reconstruct``; another model; random frames; new modules in a stage; no
-            object that moves.
+        InputError: as ``reconstruct``; a model other than a ``SurrogateMap``; random frames; new
+            modules in a stage; no fitted object.
     """
     given = list(observations) if isinstance(observations, Sequence) else [observations]
     unknowns, plain = name_unknowns(parameters), None
@@ -161,7 +161,7 @@ def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> li
 
 
 def needs_clutter(found: inversion.Reconstruction) -> bool:
-    """Return whether the data speak against a result, so that a fit among clutter may help."""
+    """True if the data are not consistent with a result, so that a fit among clutter may help."""
     return found.verdict.word in ("inconsistent", "worse", "at a bound")
 
 
@@ -170,8 +170,8 @@ def choose_result(
 ) -> inversion.Reconstruction:
     """Choose the better of two fits of the same data, without and among clutter.
 
-    That is the second one where the data do not speak against it, else the one with the lower loss
-    with clutter.
+    The second fit is chosen if the data are consistent with it, otherwise the fit with the lower
+    loss with clutter.
 
     Args:
         plain: result of ``reconstruct``.
@@ -190,13 +190,13 @@ def choose_result(
 
 @dataclass(frozen=True, eq=False)
 class Clutter:
-    """Noise and echoes that a scene does not explain.
+    """Mean power of noise and of unmodelled echoes.
 
     Attributes:
         noise: mean power of noise in a bin, in the unit of the recording.
         echoes: mean power of the echoes in every bin.
-        positions: points that reflect the echoes [m].
-        strengths: their radar cross-sections [m²], in the unit of the recording.
+        positions: reflecting points [point, 3] [m].
+        strengths: radar cross-sections of the points [m²], in the unit of the recording.
     """
 
     noise: float
@@ -206,23 +206,24 @@ class Clutter:
 
     @property
     def background(self) -> Float64[Tensor, "frame range u v"]:
-        """Mean power of both in every bin."""
+        """Mean power of noise and echoes in every bin."""
         return self.noise + self.echoes
 
     @property
     def strongest_position(self) -> Float64[Tensor, "3"]:
-        """The brightest point [m]."""
+        """Position of the brightest point [m]."""
         return self.positions[self.strengths.argmax()]
 
 
 def estimate_clutter(
     scene: Scene, observation: inversion.Observation, fitted: Sequence[str], *, seed: int = 0
 ) -> Clutter:
-    """Estimate the mean power of noise and of echoes that a scene does not explain.
+    """Estimate the mean power of noise and of unmodelled echoes.
 
-    The unexplained echoes are those of isotropic points at the height of the fitted objects, with
-    the maximum-likelihood reflectivity given the scene's own power. Points near the fitted objects
-    are left out, as far as the model blurs in range, so that clutter does not take their echoes.
+    Unmodelled echoes are represented by isotropic points at the height of the fitted objects, with
+    the maximum-likelihood reflectivity given the predicted power of the scene. Points within the
+    range blur of the fitted objects are left out, so that clutter does not absorb the echoes of
+    these.
 
     Args:
         scene: known scene, with the fitted objects at their present poses.
@@ -231,7 +232,7 @@ def estimate_clutter(
         seed: seed of the predicted map.
 
     Raises:
-        InputError: Another model.
+        InputError: A model other than a ``SurrogateMap``.
     """
     model, radar = observation.model, observation.initial_sensor()
     if not isinstance(model, SurrogateMap):

@@ -31,14 +31,14 @@ from invertwin.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class DetectedEcho:
-    """A detected echo, its place refined between the bins.
+    """Detected echo with a position refined between bins.
 
     Attributes:
-        range: [m].
-        range_rate: Range rate, positive moves away [m/s].
+        range: Range [m].
+        range_rate: Range rate, positive away from the radar [m/s].
         u, v: Direction cosines.
         position: Position in the world [m].
-        coherence: 1 where the channels are a plane wave.
+        coherence: Phase coherence of the channels, 1 for a plane wave.
     """
 
     range: float
@@ -50,20 +50,22 @@ class DetectedEcho:
 
 
 class MovingBody(nn.Module):
-    """A rigid body in motion: place, size, velocity, turn, and how much of its echo is diffuse.
+    """Moving rigid body: position, size, velocity, rotation, and diffuse share of its echo.
 
     Its axes are along the line of sight to the start, across this line, and up. The body moves in
-    the plane of the first two axes. Its height is fitted if the antennas resolve it.
-    Motion across the line of sight and a turn look much alike: hold the turn of a body that does
-    not turn. The module puts the body into a scene: where it is in the middle of the frame, and
-    with a velocity of each of its vertices.
+    the plane of the first two axes. Its height is fitted if the antennas resolve it. Cross-range
+    motion and rotation have similar echoes: fix the rotation of a body that does not rotate. The
+    module places the body in a scene, at its position in the middle of the frame and with a
+    velocity of each of its vertices.
 
     Attributes:
-        echo: Echo from which it started.
-        place: parameter [2], of the body's nearest point from the start, along and across [m].
-        height: parameter [], the same, up [m]; fitted if the radar has several rows of antennas.
-        velocity: parameter [2], along and across [m/s].
-        spin: parameter [], turn about the axis up [rad/s].
+        echo: Echo at which the fit starts.
+        place: parameter [2], displacement of the body's nearest point from the start, along and
+            across the line of sight [m].
+        height: parameter [], vertical displacement [m]; fitted if the radar has several rows of
+            antennas.
+        velocity: parameter [2], along and across the line of sight [m/s].
+        spin: parameter [], rotation rate about the vertical axis [rad/s].
         size: parameter [3], logarithms of factors on the object's size along, across and up.
         diffuse: parameter [], logit of the diffuse share of the reflected power.
     """
@@ -127,7 +129,7 @@ class MovingBody(nn.Module):
             parameter.requires_grad_(of in free and (name != "height" or rows > 1))
 
     def forward(self, scene: Scene, time: float = 0.0) -> Scene:
-        """The scene with the body in motion, where it is at a time.
+        """Return the scene with the moving body at its position at a time.
 
         Args:
             scene: Scene with the object.
@@ -188,13 +190,13 @@ _RAY_COUNT = 10_000  # of a map that is compared or drawn
 def point_response(
     model: RangeDopplerMap, radar: Radar, echo: DetectedEcho, time: float = 0.0
 ) -> Tensor:
-    """Return the map of a point at an echo: the bare response of the radar.
+    """Return the map of a point target at an echo, that is, the point response of the radar.
 
     Args:
         model: The map.
         radar: Radar with one pose.
         echo: Position and velocity of the echo.
-        time: Time after which it is seen, moving on along its line of sight [s].
+        time: Time after which the target is observed, moving along its line of sight [s].
 
     Returns:
         Power [frame, velocity, range, u, v].
@@ -213,15 +215,15 @@ def point_response(
 def detect_strongest_target(
     recording: ChirpCapture, model: RangeDopplerMap, box: tuple[Tensor, Tensor] | None = None
 ) -> DetectedEcho:
-    """The strongest detected echo of a recording: CFAR over range rate and range, then its peak.
+    """Detect the strongest moving echo of a recording by CFAR over range rate and range.
 
     Args:
         recording: One frame of chirps.
-        model: The map to look in, with all range rates.
-        box: Two corners of the box of the world that is searched [m]; None = all of the map.
+        model: Map that is searched, with all range rates.
+        box: Two corners of the searched box in world axes [m]; None = the whole map.
 
     Raises:
-        InputError: Nothing stands out of the noise.
+        InputError: No echo above the noise.
     """
     radar, chirps, grid = recording.radar(), model.chirps, model.grid
     bins = model.bins / chirps.count, radar.waveform.range_resolution / grid.range_step
@@ -272,12 +274,12 @@ def _channel_coherence(
 
 @dataclass(frozen=True, eq=False)
 class MovingTargetMaps:
-    """Maps about an echo that moves: of its twin, and of a bare point in its place.
+    """Maps around a moving echo, of its twin and of a point target at its position.
 
     Attributes:
         model: Model of the maps.
         twin_map: Power [velocity, range, u, v].
-        point_map: The same of the point.
+        point_map: Power of the point target [velocity, range, u, v].
     """
 
     model: RangeDopplerMap
@@ -285,7 +287,7 @@ class MovingTargetMaps:
     point_map: Tensor
 
     def correlations(self, recording: ChirpCapture) -> dict[str, dict[str, float]]:
-        """Correlations of ``twin`` and ``bare_psf`` with a frame of chirps, by scale."""
+        """Correlate both maps with a frame of chirps, by scale."""
         seen = self.model.observe(recording)[0]
         pair = ("twin", self.twin_map), ("bare_psf", self.point_map)
         return {
@@ -296,12 +298,12 @@ class MovingTargetMaps:
 
 @dataclass(frozen=True, eq=False)
 class MovingTargetFit:
-    """A body that was fitted to the strongest mover of a recording.
+    """Fit of a body to the strongest moving target of a recording.
 
     Attributes:
         recording: One frame of chirps.
         model: Map of the whole recording.
-        body: As fitted.
+        body: Fitted body.
         reconstruction: Result of the fit.
     """
 
@@ -313,7 +315,7 @@ class MovingTargetFit:
     def predict_maps(
         self, scene: Scene, cells: int, *, time: float = 0.0, seed: int = 0
     ) -> MovingTargetMaps:
-        """Maps about the place that the echo has moved to.
+        """Predict maps around the position of the echo at a time.
 
         Args:
             scene: Scene with the body's object.

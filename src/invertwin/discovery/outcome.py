@@ -42,12 +42,12 @@ class ObjectTrack:
 
 @dataclass(frozen=True, eq=False)
 class DetectedObject:
-    """One object of a twin.
+    """Object of a twin.
 
     Attributes:
         name: name in the twin's scene.
         kind: kind of its shape, among ``discovery.KINDS``.
-        probabilities: probability of every kind that was tried.
+        probabilities: probability of every tested kind.
         position: centre [m].
         shape: all shape parameters; None = only the position is known.
         deviations: standard deviation of every number, by name, in SI units. For a moving target
@@ -72,14 +72,14 @@ class DetectedObject:
     def point(
         cls, name: str, position: Tensor, deviations: Mapping[str, float], sure: float, *motion: Any
     ) -> "DetectedObject":
-        """An object without a shape.
+        """Create an object without a shape.
 
         Args:
             name: name of the object.
             position: position [m].
             deviations: standard deviations of its coordinates.
-            sure: probability that it exists.
-            motion: its velocity [m/s] and track.
+            sure: existence probability.
+            motion: velocity [m/s] and track of the object.
         """
         return cls(name, "point", {"point": 1.0}, position, None, deviations, sure, *motion)
 
@@ -115,7 +115,7 @@ class GroundImage:
     Attributes:
         positions: x and y of every point [m].
         strength: radar cross-section at every position, or brightness of a backprojected image.
-        view_counts: number of radar positions that see each position; zero is "never seen".
+        view_counts: number of radar positions that see each position; zero = unobserved.
     """
 
     positions: Float64[Tensor, "point 2"]
@@ -135,7 +135,7 @@ class Twin:
             found.
         observed: maps of the recording.
         grid: bins of the maps.
-        notes: remarks, in sentences.
+        notes: remarks on the search.
         calibration: channel calibration estimated from the scene itself, applied to the maps.
     """
 

@@ -158,7 +158,7 @@ _NOTES = read_table("invertwin.discovery", "notes.toml")
 def _find_static_objects(
     capture: Capture, grid: Grid, level: float, positions: Tensor, step: float, rays: int, seed: int
 ) -> Twin:
-    """Find the shapes that explain the maps of a recording."""
+    """Find the shapes that fit the maps of a recording."""
     power = capture.spectrum(grid).detach().float()
     radar, frames = capture.radar(), capture.frame_count
     model = SurrogateMap(grid, sampling=make_sampling(frames, rays))

@@ -63,7 +63,7 @@ def count_parameters(shape: ShapeParameters) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ShapeSearch:
-    """Search for the shapes that explain maps.
+    """Search for the shapes that fit maps.
 
     Evidence is the log-likelihood of the fitted frames minus half the logarithm of the number of
     draws per free parameter (BIC); a change must not lower the likelihood of held-out frames

@@ -39,13 +39,13 @@ class CellSampling:
     """Numbers of sample points in the cells of a map.
 
     Attributes:
-        points: Least number of points in a cell; a cell has the next square number of them.
-        edge_points: Number of points on edges of the scene, for each transmitter; they serve
-            derivatives alone.
+        points: Minimum number of points in a cell; a cell has the next square number of points.
+        edge_points: Number of points on edges of the scene, for each transmitter; used by
+            derivatives only.
         boundary: False leaves boundary paths out: derivatives at fixed visibility, for ablation.
 
     Raises:
-        InputError: A number out of range, or boundary paths without edge points.
+        InputError: A value out of range, or boundary paths without edge points.
     """
 
     points: Count = 16
@@ -57,7 +57,7 @@ class CellSampling:
 
     @property
     def points_per_side(self) -> int:
-        """Points along each side of a cell."""
+        """Number of points along each side of a cell."""
         return math.isqrt(self.points - 1) + 1
 
 
@@ -161,16 +161,16 @@ class Cells(ReceiverLocations):
 
 @dataclass(frozen=True, eq=False)
 class MapPlane(Cells):
-    """Equal cells of a parallelogram.
+    """Cells of a radio map: equal parallelograms in a plane.
 
     Attributes:
-        corner: [m].
-        first, second: Sides, from the corner on [m].
-        count: Cells along them.
+        corner: Position of a corner of the map [3] [m].
+        first, second: Side vectors of the map, from the corner [3] [m].
+        count: Numbers of cells along both sides.
         sampling: Numbers of points.
 
     Raises:
-        InputError: Wrong shapes, NaN, sides without an area between them, or no cell.
+        InputError: Wrong shapes, NaN, parallel sides, or no cell.
     """
 
     corner: Float64[Tensor, "3"]
@@ -203,17 +203,18 @@ class MapPlane(Cells):
         cell_size: float,
         sampling: CellSampling = CellSampling(),
     ) -> "MapPlane":
-        """Cells over x and y at one height z.
+        """Create a horizontal map of cells at height z.
 
         Args:
-            low: Least x and y [m].
-            high: Greatest x and y [m].
-            height: z [m].
-            cell_size: Length of a cell's sides; the nearest that divides the sides of the map [m].
+            low: Minimum x and y [2] [m].
+            high: Maximum x and y [2] [m].
+            height: Height z of the map [m].
+            cell_size: Side length of a cell [m]; the nearest length that divides the sides of the
+                map is used.
             sampling: Numbers of points.
 
         Raises:
-            InputError: Wrong shapes or numbers, or a map without an area.
+            InputError: Wrong shapes or values, or a map without an area.
         """
         do = "give x and y"
         start = checks.checked_tensor(low, (2,), "low of a map [m]", do)
@@ -230,12 +231,12 @@ class MapPlane(Cells):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Cells along the first and the second side."""
+        """Numbers of cells along the first and the second side."""
         return self.count
 
     @property
     def centres(self) -> Float64[Tensor, "first second 3"]:
-        """Middles of the cells [m]."""
+        """Centres of the cells [m]."""
         at = [(torch.arange(n, dtype=torch.float64) + 0.5) / n for n in self.count]
         return self._point_at(at[0][:, None], at[1][None])
 
@@ -251,7 +252,7 @@ class MapPlane(Cells):
         return Mesh(torch.stack([a, a + u, a + u + v, a + v]), _TRIANGLES)
 
     def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
-        """One random point in each square of a finer grid. See ``Cells.sample_points``."""
+        """Sample one random point in each square of a finer grid. See ``Cells.sample_points``."""
         side = self.sampling.points_per_side
         lattice = [side * n for n in self.count]
         jitter = torch.from_numpy(rng.random((2, *lattice)))
@@ -261,7 +262,7 @@ class MapPlane(Cells):
         return points.transpose(1, 2).reshape(-1, side * side, 3)
 
     def find_cells(self, points: _Points, faces: _FaceNumbers) -> _FaceNumbers:
-        """Cells that hold points of the plane. See ``Cells.find_cells``."""
+        """Find the cells that contain points of the plane. See ``Cells.find_cells``."""
         offset, n = points - self.corner, self._normal
         n = n / n.square().sum()
         i = (torch.linalg.cross(offset, self.second.expand_as(offset)) @ n * self.count[0]).floor()
@@ -282,11 +283,11 @@ _TRIANGLES = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 @dataclass(frozen=True, eq=False)
 class MapMesh(Cells):
-    """The triangles of a mesh, each a cell.
+    """Cells of a radio map: the triangles of a mesh.
 
     Attributes:
-        mesh: Mesh in the world [m]. Where it covers a surface of the scene, keep it some
-            millimetres off.
+        mesh: Mesh in world axes [m]; at a surface of the scene, keep it some millimetres away from
+            the surface.
         sampling: Numbers of points.
 
     Raises:
@@ -321,7 +322,7 @@ class MapMesh(Cells):
         return self.mesh
 
     def sample_points(self, rng: np.random.Generator) -> Float64[Tensor, "cell point 3"]:
-        """One random point in each of equal parts of triangles. See ``Cells.sample_points``."""
+        """Sample a random point in each equal part of a triangle. See ``Cells.sample_points``."""
         side, cells = self.sampling.points_per_side, len(self.mesh.faces)
         jitter = torch.from_numpy(rng.random((2, cells, side, side)))
         steps = torch.arange(side, dtype=torch.float64)

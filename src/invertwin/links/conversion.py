@@ -1,4 +1,4 @@
-"""Paths that Sionna RT has found, as ours."""
+"""Conversion of paths of Sionna RT."""
 
 from typing import Any
 
@@ -19,12 +19,12 @@ _KINDS = {
 
 
 def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
-    """The `Paths` of Sionna RT 2.2 as ``RayPaths``.
+    """Convert the `Paths` of Sionna RT 2.2 to ``RayPaths``.
 
     Its arrays must have one element with ``pattern="iso"`` and ``polarization="VH"``, so that its
-    coefficients are whole 2 × 2 matrices. Objects and triangles are not known by number, and its
-    convention of phases stays: sheets mirror at their surface, and the length of a path counts
-    their thickness twice.
+    coefficients are complete 2 × 2 matrices. Indices of objects and triangles are not available.
+    The phase convention of Sionna RT is kept: sheets reflect at their surface, and path lengths
+    count their thickness twice.
 
     Args:
         paths: Paths from its `PathSolver`.

@@ -20,14 +20,14 @@ def path_table(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> str:
-    """The paths of one link as text, the shortest first.
+    """Format the paths of one link as text, shortest first.
 
-    Powers are received over sent, of the first elements. Directions are azimuth and elevation in
-    the world in degrees, x towards y and up to z.
+    Powers are ratios of received to transmitted power of the first elements. Directions are azimuth
+    and elevation in the world in degrees, x towards y and up to z.
 
     Args:
         paths: Paths from ``trace_paths``.
-        link: Numbers of transmitter and receiver.
+        link: Indices of transmitter and receiver.
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
     """

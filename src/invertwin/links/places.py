@@ -18,7 +18,7 @@ class ReceiverLocations(ABC):
     """Receiver locations of a ``RadioMap``.
 
     Attributes:
-        is_random: Whether a seed draws points.
+        is_random: True if points are drawn at random.
     """
 
     is_random: ClassVar[bool] = False
@@ -42,24 +42,24 @@ class ReceiverLocations(ABC):
         """
 
     def with_sample_count(self, samples: int) -> "ReceiverLocations":
-        """The same places with so many points in all, where points are drawn.
+        """Return the same locations with another total number of random points.
 
         Args:
-            samples: Their number.
+            samples: Total number of points.
         """
         return self
 
     def fixed_visibility(self) -> "ReceiverLocations | None":
-        """The same places without boundary paths, for ablation; None where there are none."""
+        """Locations without boundary paths, for ablation; None if there are no boundary paths."""
         return None
 
 
 @dataclass(frozen=True, eq=False)
 class ReceiverPoints(ReceiverLocations):
-    """Single points.
+    """Receiver locations at single points.
 
     Attributes:
-        positions: [place, 3] in the world [m]. Differentiable.
+        positions: Positions [receiver, 3] in world axes [m]. Differentiable.
 
     Raises:
         InputError: Wrong shapes, NaN, or no point.

@@ -1,12 +1,12 @@
 """Path gain and delay spread of many links at once.
 
-Powers of paths may add, or their fields. The mean over a band stands between: fields of paths add
-whose delays differ by less than 1/B, powers of the others,
+Either the powers or the fields of paths are added. The mean over a band lies between these: fields
+are added for paths whose delays differ by less than 1/B, otherwise powers,
 
     ⟨|H|²⟩ = Σᵢ Σⱼ aᵢ aⱼ* exp(−j2πf₀(τᵢ − τⱼ)) sinc(B(τᵢ − τⱼ)).
 
-At the shadow of an edge the lost path and what the edge diffracts have one delay: their fields add
-in every band, and the mean has no jump. Powers that add would jump by up to 7 dB.
+At the shadow boundary of an edge, the lost path and the diffracted path have the same delay: their
+fields are added in every band, and the mean has no jump. A sum of powers would jump by up to 7 dB.
 """
 
 import math
@@ -46,8 +46,8 @@ class LinkStatistics:
     """Path gain and delay spread at receiver locations, for every transmitter.
 
     Attributes:
-        gain: Received over sent power.
-        delay_spread: Root mean square, by the powers of paths [s].
+        gain: Ratio of received to transmitted power, [tx, …].
+        delay_spread: Root-mean-square delay spread, weighted by the powers of paths [s].
     """
 
     gain: Float64[Tensor, "tx *place"]
@@ -59,19 +59,19 @@ class PropagationSettings:
     """Settings of the search for propagation paths and of the sum over them.
 
     Attributes:
-        frequency: The carrier [Hz].
-        bandwidth: Bandwidth of the receivers [Hz]: powers are means over this band. 0 = fields add
-            at the carrier alone, None = powers of paths add.
-        depth: Most surfaces that a path meets, see ``trace_paths``.
-        edges: Most edges that a path goes round.
-        rays: Shot to find sequences of surfaces; None tries all.
-        receivers: Antenna and axes of every receiver; of several elements the mean power counts.
-        panels: Metasurfaces, whose paths are added, see ``panel_paths``.
-        rough: Sampling of paths that rough surfaces scatter, over all receivers; their power
-            is added. None leaves them out.
+        frequency: Carrier frequency [Hz].
+        bandwidth: Bandwidth of the receivers [Hz]: powers are means over this band. 0 = fields are
+            added at the carrier; None = powers of paths are added.
+        depth: Maximum number of interactions with surfaces per path, see ``trace_paths``.
+        edges: Maximum number of edge diffractions per path.
+        rays: Number of rays that search for sequences of surfaces; None = all sequences are tested.
+        receivers: Antenna mount of every receiver; the power is the mean over its elements.
+        panels: Metasurfaces whose paths are added, see ``panel_paths``.
+        rough: Sampling of paths scattered by rough surfaces, over all receivers; their power is
+            added. None = left out.
 
     Raises:
-        InputError: A number out of range, or edges without a bandwidth.
+        InputError: A value out of range, or edges without a bandwidth.
     """
 
     frequency: float
@@ -97,7 +97,7 @@ class PropagationSettings:
     def trace_links(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> RayPaths:
-        """The paths from all transmitters to some receivers.
+        """Trace the paths from all transmitters to some receivers.
 
         Args:
             scene: Propagation environment.
@@ -126,7 +126,7 @@ class PropagationSettings:
     def gains_and_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> tuple[Float64[Tensor, "tx place"], Float64[Tensor, "tx place 3"]]:
-        """Gains at points, as paths add up, and sums of ``moments``. Arguments as in ``at``.
+        """Gains at points by the chosen sum over paths, and sums of ``moments``.
 
         Args:
             scene: Propagation environment.
@@ -147,7 +147,7 @@ class PropagationSettings:
     def path_moments(
         self, paths: RayPaths, tx: _Senders, rx: _Receivers, tx_mount: AntennaMount
     ) -> Float64[Tensor, "path 3"]:
-        """Power of each path, and that times its excess delay [s] and the square of it [s²].
+        """Power of each path, and its products with the excess delay [s] and with its square [s²].
 
         The excess delay is that over the straight line.
 
@@ -197,7 +197,7 @@ class PropagationSettings:
     def rough_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
-        """Sums of ``moments`` over paths that rough surfaces scatter; 0 if these are left out.
+        """Sums of ``moments`` over paths scattered by rough surfaces; 0 if these are left out.
 
         Args:
             scene: Scene with rough surfaces.
@@ -218,7 +218,7 @@ class PropagationSettings:
         frequencies: Float64[Tensor, " frequency"],
         seed: int,
     ) -> Complex128[Tensor, "tx place frequency"]:
-        """H(f) of the first elements, at points. See ``frequency_response``.
+        """Compute H(f) of the first elements at points. See ``frequency_response``.
 
         Args:
             scene: Propagation environment.
@@ -285,13 +285,13 @@ def received_gain(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> Float64[Tensor, "rx tx"]:
-    """Received over sent power of every link; 0 where no path leads.
+    """Ratio of received to transmitted power of every link; 0 without a path.
 
     Args:
         paths: Paths from ``trace_paths``.
         bandwidth: Bandwidth of the mean, about the carrier [Hz]; 0 = the carrier alone,
             None = powers of paths add.
-        tx: Antenna mount of the transmitters; of several elements the mean over all pairs counts.
+        tx: Antenna mount of the transmitters; the gain is the mean over all pairs of elements.
         rx: Antenna mount of the receivers.
     """
     amplitude, delay = path_amplitudes(paths, tx, rx)

@@ -1,8 +1,8 @@
-"""From paths to responses: over frequency, over delay, and over symbols and subcarriers.
+"""Channel responses of paths over frequency, over delay, and over symbols and subcarriers.
 
-A path adds ``a exp(−j2πfτ)``. Every element of an array sees it earlier by (u·p)/c, with u the
-direction of the path at the array and p the element's place: arrays are small against the lengths
-of paths. Where they are not, trace the elements as antennas of their own.
+A path adds ``a exp(−j2πfτ)``. The delay at an element of an array is shorter by (u·p)/c, with u the
+direction of the path at the array and p the element's position: arrays must be small compared with
+path lengths. For larger arrays, trace the elements as separate antennas.
 """
 
 import math
@@ -32,16 +32,16 @@ def _world_axes() -> Tensor:
 class AntennaMount:
     """Antenna array mounted at each position of transmitters, or of receivers.
 
-    V and H of the array's polarisation are about its z axis. By default a terminal is one isotropic
-    element for V, and its axes are the world's: it looks along x.
+    V and H of the array's polarisation are about its z axis. By default, a mount has one isotropic
+    element with polarisation V, and the world's axes: its boresight is x.
 
     Attributes:
-        array: Elements about each place.
-        rotations: Columns are the array's x (boresight), y and z axes in the world: one for all
-            [3, 3], or one for each place [place, 3, 3].
+        array: Antenna array; element positions are relative to the position of the mount.
+        rotations: Rotation matrices whose columns are the array's x (boresight), y and z axes in
+            the world: one for all positions [3, 3], or one for each [position, 3, 3].
 
     Raises:
-        InputError: Rotations of another shape, or that are not orthonormal.
+        InputError: Rotations of a wrong shape, or not orthonormal.
     """
 
     array: AntennaArray = field(default_factory=lambda: AntennaArray(torch.zeros(1, 3).double()))
@@ -58,7 +58,7 @@ class AntennaMount:
     def element_weights(
         self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
     ) -> Complex128[Tensor, "path element 2"]:
-        """Field of each element along directions, over V and H of ``RayPaths``.
+        """Compute the field of each element along directions, over V and H of ``RayPaths``.
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
@@ -87,10 +87,10 @@ class AntennaMount:
         wave_number: float,
         zone: Float64[Tensor, " path"],
     ) -> Complex128[Tensor, "path element 2"]:
-        """Derivative of the field of each element as directions turn about axes [1/rad].
+        """Derivative of the field of each element with respect to rotations about axes [1/rad].
 
-        The field turns with them: what is alike on all sides of an axis has none. The elements'
-        places count, by the phase from element to element.
+        The field vectors rotate with the directions: the derivative of a field that is symmetric
+        about an axis is zero. Phases from element to element are included.
 
         In the far zone of an antenna, its field changes across the first Fresnel zone by less than
         its peak. Where a model changes faster, as the polarisation V of an isotropic element about
@@ -120,7 +120,7 @@ class AntennaMount:
     def element_advances(
         self, direction: Float64[Tensor, "path 3"], index: Int64[Tensor, " path"]
     ) -> Float64[Tensor, "path element"]:
-        """Path length to the position of the array minus that to each element [m].
+        """Path length to the origin of the array minus that to each element [m].
 
         Args:
             direction: Unit vectors in the world, away from the terminal.
@@ -147,7 +147,7 @@ _DEFAULT = AntennaMount()
 def path_amplitudes(
     paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> tuple[Complex128[Tensor, "path rx_ant tx_ant"], Float64[Tensor, "path rx_ant tx_ant"]]:
-    """Coefficient and delay [s] of every path between every two elements.
+    """Compute coefficient and delay [s] of every path between every pair of elements.
 
     Args:
         paths: Paths from ``trace_paths``.
@@ -190,26 +190,26 @@ def frequency_response(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant frequency"]:
-    """H(f) = Σ a exp(−j2πfτ) between all elements; zero where no path leads.
+    """Frequency response H(f) = Σ a exp(−j2πfτ) between all elements; zero without a path.
 
-    Delays are exact at all frequencies, coefficients are those of ``paths.frequency``: over a wide
-    band, trace again at some frequencies.
+    Delays are exact at all frequencies; coefficients are those at ``paths.frequency``. For a wide
+    band, trace at several frequencies.
 
     Args:
         paths: Paths from ``trace_paths``.
-        frequencies: One or several, in any order [Hz].
+        frequencies: One or several frequencies, in any order [Hz].
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
 
     Raises:
-        InputError: No frequency, or one that is not finite.
+        InputError: No frequency, or a frequency that is not finite.
     """
     swept, start = checked_frequencies(frequencies), torch.zeros(1, dtype=torch.float64)
     return _evaluate_responses(paths, swept, start, tx, rx)[..., 0, :]
 
 
 def checked_frequencies(frequencies: checks.ArrayLike) -> Float64[Tensor, " frequency"]:
-    """One or several frequencies [Hz] as a row."""
+    """Check one or several frequencies [Hz] and return them as a vector."""
     swept = torch.atleast_1d(torch.as_tensor(frequencies, dtype=torch.float64))
     return checks.checked_tensor(swept, (None,), "frequencies [Hz]", "give one or several")
 
@@ -224,19 +224,19 @@ def ofdm_channel(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant symbol subcarrier"]:
-    """The channel of every symbol and subcarrier of OFDM.
+    """Channel coefficients of every OFDM symbol and subcarrier.
 
-    Subcarriers are centred: number k has the frequency ``paths.frequency + (k − N//2) · spacing``.
-    Symbols follow each other after 1/spacing plus the cyclic prefix, which is taken as long enough
-    for all paths. Within a symbol paths stand still; from one to the next phases turn by Doppler
-    shifts, in proportion to each subcarrier's frequency.
+    Subcarriers are centred: subcarrier k has the frequency
+    ``paths.frequency + (k − N//2) · spacing``. The symbol period is 1/spacing plus the cyclic
+    prefix, which is assumed long enough for all paths. Paths are static within a symbol; from
+    symbol to symbol, phases rotate by Doppler shifts, in proportion to each subcarrier's frequency.
 
     Args:
         paths: Paths from ``trace_paths``.
-        subcarriers: Their number N.
+        subcarriers: Number N of subcarriers.
         spacing: Spacing of subcarriers [Hz].
-        symbols: Their number.
-        cyclic_prefix: [s].
+        symbols: Number of symbols.
+        cyclic_prefix: Duration of the cyclic prefix [s].
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
 
@@ -263,16 +263,16 @@ def impulse_response(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant tap"]:
-    """The impulse response in a band about the carrier: h_n = Σ a exp(−j2πf₀τ) sinc(B(τ − t_n)).
+    """Impulse response in a band about the carrier: h_n = Σ a exp(−j2πf₀τ) sinc(B(τ − t_n)).
 
-    Taps are at t_n = start + n/B. Without a band a path is its delay and amplitude
-    (``path_amplitudes``).
+    Taps are at t_n = start + n/B. For delays and amplitudes of paths without a band limit, see
+    ``path_amplitudes``.
 
     Args:
         paths: Paths from ``trace_paths``.
-        bandwidth: B [Hz].
-        taps: Their number.
-        start: Delay of the first one [s].
+        bandwidth: Bandwidth B [Hz].
+        taps: Number of taps.
+        start: Delay of the first tap [s].
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
 
@@ -328,18 +328,18 @@ def _sum_by_link(paths: RayPaths, values: Tensor) -> Tensor:
 def sum_over_paths(
     paths: RayPaths, values: Float64[Tensor, "path *value"] | Complex128[Tensor, "path *value"]
 ) -> Float64[Tensor, "tx rx *value"] | Complex128[Tensor, "tx rx *value"]:
-    """Sum values of paths over those of each link.
+    """Sum values of paths over each link.
 
     Args:
         paths: Paths.
-        values: One or several numbers of each.
+        values: One or several numbers per path.
     """
     total = values.new_zeros(paths.counts[0] * paths.counts[1], *values.shape[1:])
     return total.index_add(0, paths.link, values).unflatten(0, paths.counts)
 
 
 def phasor(cycles: Float64[Tensor, "*any"]) -> Complex128[Tensor, "*any"]:
-    """exp(j2π cycles), of whole cycles less.
+    """Phasor exp(j2π cycles), computed without the whole cycles.
 
     Args:
         cycles: Phases over 2π.

@@ -16,7 +16,7 @@ _DEFAULT = AntennaMount()
 def delay_spread(
     paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> Float64[Tensor, "rx tx"]:
-    """Root mean square spread of the delays by power [s]; 0 of links of one path or none.
+    """Root-mean-square delay spread, weighted by power [s]; 0 for links of at most one path.
 
     Args:
         paths: Paths from ``trace_paths``.
@@ -36,14 +36,14 @@ def angle_spread(
     tx: AntennaMount = _DEFAULT,
     rx: AntennaMount = _DEFAULT,
 ) -> Float64[Tensor, "rx tx"]:
-    """Spread of the directions by power, √(1 − |u|²) with u the mean unit vector.
+    """Angular spread √(1 − |u|²), with u the mean unit vector weighted by power.
 
-    From 0 of one direction to 1 of all alike; of directions close together it is their root mean
-    square angle [rad]. It does not depend on axes.
+    The spread is 0 for a single direction and 1 for a uniform distribution; for a narrow
+    distribution it is the root-mean-square angle [rad]. It does not depend on axes.
 
     Args:
         paths: Paths from ``trace_paths``.
-        end: End of the paths.
+        end: End of the paths whose directions are used.
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
 
@@ -67,9 +67,9 @@ def angle_spread(
 def rician_factor(
     paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
 ) -> Float64[Tensor, "rx tx"]:
-    """Power of the straight path over that of all others; also where it passes through sheets.
+    """Power ratio of the straight path, also through sheets, to all other paths.
 
-    It is 0 without a straight path, and infinite without others.
+    The ratio is 0 without a straight path, and infinite without other paths.
 
     Args:
         paths: Paths from ``trace_paths``.
@@ -85,7 +85,7 @@ def rician_factor(
 
 
 def path_powers(paths: RayPaths, tx: AntennaMount, rx: AntennaMount) -> Float64[Tensor, " path"]:
-    """Received over sent power of each path, mean of all pairs of elements.
+    """Ratio of received to transmitted power of each path, averaged over all pairs of elements.
 
     Args:
         paths: Paths from ``trace_paths``.
@@ -105,10 +105,10 @@ def _nonzero(total: Tensor) -> Tensor:
 
 
 def safe_sqrt(square: Tensor) -> Tensor:
-    """A root without the infinite derivative at zero.
+    """Square root with a finite derivative at zero.
 
     Args:
-        square: Number whose root is taken; negative ones count as zero.
+        square: Values; negative values are treated as zero.
     """
     some = square > 0
     return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)

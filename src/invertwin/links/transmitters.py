@@ -16,12 +16,12 @@ from invertwin.scene.parameters import Coordinate, axes_mask, free_part, positio
 
 @dataclass(frozen=True, eq=False)
 class Transmitters:
-    """The sensor of a ``RadioMap``: one or several transmitters, all with the same antenna.
+    """Sensor of a ``RadioMap``: one or several transmitters with the same antenna.
 
     Attributes:
-        positions: [tx, 3] in the world [m]; one may be given as [3]. Differentiable.
-        mount: Antenna and axes at each place; of several elements the mean power counts.
-        power_dbm: Sent by each [dBm], one for all or one each.
+        positions: Positions [tx, 3], or [3] of a single one, in world axes [m]. Differentiable.
+        mount: Antenna mount at each position; the power is the mean over its elements.
+        power_dbm: Transmitted power [dBm], one value for all transmitters or one for each.
 
     Raises:
         InputError: Wrong shapes, NaN, or no transmitter.
@@ -42,14 +42,14 @@ class Transmitters:
 
     @property
     def powers(self) -> Float64[Tensor, " tx"]:
-        """Sent by each [mW]."""
+        """Transmitted power of each [mW]."""
         return 10.0 ** (torch.as_tensor(self.power_dbm) / 10)
 
     def frames(self, chosen: Sequence[int]) -> "Transmitters":
-        """Only some of the transmitters.
+        """Select some of the transmitters.
 
         Args:
-            chosen: Their numbers.
+            chosen: Indices of the transmitters.
         """
         rows, terminals = torch.as_tensor(chosen), self.mount
         if terminals.rotations.ndim == 3:
@@ -58,23 +58,24 @@ class Transmitters:
 
 
 class TransmitterPosition(nn.Module):
-    """Places one transmitter: a module Transmitters → Transmitters that a fit moves.
+    """Module Transmitters → Transmitters with the position of one transmitter as parameter.
 
-    With a box the place stays inside of it, such as the room: a step that leads out of it ends on
-    its border.
+    With a box, such as a room, the position stays inside the box: a step that leaves it is clamped
+    to its border.
 
     Args:
-        initial: [m].
-        low: A corner of the box [m]; None = no box.
-        high: The opposite corner.
-        axes: World axes along which the fit may move it; the others keep their values.
-        number: Number of the transmitter.
+        initial: Initial position [3] [m].
+        low: Corner of the box [3] [m]; None = no box.
+        high: Opposite corner of the box [3] [m].
+        axes: World axes along which the position is fitted; other coordinates are fixed.
+        number: Index of the transmitter.
 
     Attributes:
-        place: parameter [3], metres.
+        place: Parameter [3], position [m].
 
     Raises:
-        InputError: Not three numbers, an unknown axis, one corner alone, or a start outside.
+        InputError: A wrong shape, an unknown axis, only one corner, or an initial position outside
+            the box.
     """
 
     def __init__(
@@ -115,16 +116,16 @@ class TransmitterPosition(nn.Module):
         return free_part(self.raw_position, self._axes)
 
     def forward(self, sensor: Transmitters) -> Transmitters:
-        """The transmitters with this one placed."""
+        """Return the transmitters with the position of this one."""
         own = (torch.arange(len(sensor.positions)) == self._number)[:, None]
         return replace(sensor, positions=torch.where(own, self.position, sensor.positions))
 
     def values(self) -> dict[str, Tensor]:
-        """The place [m] by name, for progress and reports."""
+        """Position [m] by name, for progress and reports."""
         return {"transmitter.position": self.position.detach().clone()}
 
     def coordinates(self) -> list[Coordinate]:
-        """x, y and z of the transmitter, as far as they are free."""
+        """Free coordinates among x, y and z of the transmitter."""
         return position_coordinates("transmitter", "raw_position", self._axes)
 
     def at_bounds(self) -> list[str]:

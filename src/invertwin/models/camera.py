@@ -27,32 +27,32 @@ class _ImageMap(ForwardModel):
     holds_fields: ClassVar[bool] = True
 
     def realisations(self, scene: Scene, sensor: Camera, seed: int) -> Realisations:
-        """The images with other errors each time."""
+        """Return images with independent errors."""
         return add_white_errors(self.predict(scene, sensor, seed), self.scatter)
 
     def for_differences(
         self, scene: Scene, sensor: Camera, samples: int, scheme: Literal["rays", "area"]
     ) -> ForwardModel:
-        """More rays in every pixel. See ``ForwardModel.for_differences``."""
+        """Return the model with more rays per pixel. See ``ForwardModel.for_differences``."""
         pixels = len(sensor.positions) * sensor.width * sensor.height
         return self.with_sampling(samples=max(self.sampling.samples, samples // pixels))
 
     def ablations(self) -> dict[str, ForwardModel]:
-        """The model with outlines at rest. See ``ForwardModel.ablations``."""
+        """Return the model with fixed outlines. See ``ForwardModel.ablations``."""
         return {"boundary": self.with_sampling(boundary=False)} if self.sampling.boundary else {}
 
 
 @dataclass(frozen=True)
 class SilhouetteMap(_ImageMap):
-    """Masks of some objects as a camera sees them: 1 inside, 0 outside, between at their outlines.
+    """Camera masks of objects: 1 inside, 0 outside, values between these at outlines.
 
     Compare them by ``SpectrumLoss(gain="one")``. Masks of several objects are several observations.
 
     Attributes:
-        objects: Names of the objects that the mask shows; others may hide them.
+        objects: Names of the objects of the mask; other objects may occlude them.
         sampling: Sampling of pixels and outlines.
-        scatter: Standard deviation of measured masks about the map; None = as large as what a fit
-            leaves unexplained.
+        scatter: Standard deviation of measured masks about the map; None = estimated from the
+            residual of a fit.
     """
 
     objects: tuple[str, ...]
@@ -60,11 +60,11 @@ class SilhouetteMap(_ImageMap):
     scatter: float | None = None
 
     def predict(self, scene: Scene, sensor: Camera, seed: int) -> _Images:
-        """The masks. See ``ForwardModel.predict``."""
+        """Predict the masks. See ``ForwardModel.predict``."""
         return silhouettes(scene, sensor, self.objects, self.sampling, seed)
 
     def observe(self, recording: ArrayLike) -> _Images:
-        """Measured masks, [frame, row, column] or [row, column], from 0 to 1.
+        """Return measured masks, [frame, row, column] or [row, column], from 0 to 1.
 
         Raises:
             InputError: Another shape, NaN, or values outside of 0 to 1.
@@ -85,10 +85,10 @@ class DepthMap(_ImageMap):
     Compare them by ``SpectrumLoss(gain="one")``.
 
     Attributes:
-        far: Depth where nothing is seen, or what is further away [m].
+        far: Depth of empty pixels, and maximum depth [m].
         sampling: Sampling of pixels and outlines.
-        scatter: Standard deviation of measured depths about the map [m]; None = as large as what a
-            fit leaves unexplained.
+        scatter: Standard deviation of measured depths about the map [m]; None = estimated from the
+            residual of a fit.
     """
 
     far: Positive
@@ -96,11 +96,11 @@ class DepthMap(_ImageMap):
     scatter: float | None = None
 
     def predict(self, scene: Scene, sensor: Camera, seed: int) -> _Images:
-        """The depths. See ``ForwardModel.predict``."""
+        """Predict the depths. See ``ForwardModel.predict``."""
         return depths(scene, sensor, self.far, self.sampling, seed)
 
     def observe(self, recording: ArrayLike) -> _Images:
-        """Measured depths, [frame, row, column] or [row, column] [m], at most ``far``.
+        """Clamp measured depths [frame, row, column] or [row, column] to ``far`` [m].
 
         Raises:
             InputError: Another shape, or NaN.

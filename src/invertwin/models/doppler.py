@@ -32,18 +32,18 @@ _Maps = Float[Tensor, "frame velocity range u v"]  # power of every frame
 class RangeDopplerMap(ForwardModel):
     """Power over range rate, range and direction of moving targets.
 
-    What stands still is taken out of a recording as the mean over the chirps; so a prediction
-    holds the objects with a velocity alone. Other objects hide them. A silhouette has no boundary
-    term: a rough convex body goes dark towards its edge.
+    Static echoes are removed from a recording by subtracting the mean over the chirps, so a
+    prediction includes only objects with a velocity; static objects occlude them. Silhouettes have
+    no boundary term: the power of a rough convex body vanishes towards its silhouette.
 
     Attributes:
         grid: Ranges and directions.
         chirps: Timing of the ramps.
-        rates: Range rates to show, positive moves away [m/s]; some of those of ``bins``.
-        bins: Bins of range rate over the whole unambiguous span.
+        rates: Range rates of the map, positive away from the radar [m/s]; a subset of ``bins``.
+        bins: Number of range-rate bins over the whole unambiguous span.
         sampling: Sampling of paths; one bounce, fixed visibility.
-        mirrors: Names of smooth flat objects at rest, in which what moves is seen a second time
-            (ghosts): paths of up to three surfaces.
+        mirrors: Names of smooth flat objects at rest that form mirror images (ghosts) of moving
+            objects: paths of up to three surfaces.
     """
 
     grid: Grid
@@ -66,13 +66,13 @@ class RangeDopplerMap(ForwardModel):
         sampling: Sampling | None = None,
         mirrors: Sequence[str] = (),
     ) -> "RangeDopplerMap":
-        """All range rates that the chirps tell apart.
+        """Create a map of all range rates that the chirps resolve.
 
         Args:
             radar: Radar that records.
             grid: Ranges and directions.
             chirps: Timing of the ramps.
-            oversample: Bins of range rate per cell.
+            oversample: Number of range-rate bins per cell.
             sampling: Sampling of paths.
             mirrors: Smooth flat objects at rest.
         """
@@ -88,7 +88,7 @@ class RangeDopplerMap(ForwardModel):
             )
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> _Maps:
-        """The expected power of moving targets. See ``ForwardModel.predict``.
+        """Predict the expected power of moving targets. See ``ForwardModel.predict``.
 
         Raises:
             InputError: No object has a velocity.
@@ -117,10 +117,10 @@ class RangeDopplerMap(ForwardModel):
         return range_doppler_power(paths, paths.velocity, radar, self.grid, self.chirps, self.rates)
 
     def observe(self, recording: ChirpCapture) -> _Maps:
-        """The measured power of moving targets.
+        """Return the measured power of moving targets.
 
         Raises:
-            InputError: A recording of another number of chirps.
+            InputError: A recording with another number of chirps.
         """
         beat, radar = recording.beat, recording.radar()
         moving = (beat - beat.mean(1, keepdim=True)).to(torch.complex128)
@@ -129,7 +129,7 @@ class RangeDopplerMap(ForwardModel):
         return power[:, rows]
 
     def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations:
-        """Recordings of the moving scene with other speckle and noise each time.
+        """Return recordings of the moving scene with independent speckle and noise.
 
         A few hundred points of each surface are enough for developed speckle.
         """
@@ -161,7 +161,7 @@ class RangeDopplerMap(ForwardModel):
     def crop_around(
         self, range_: float, rate: float, cells: int, radar: Radar
     ) -> "RangeDopplerMap":
-        """The cells at most so many range and Doppler cells from an echo, in all directions.
+        """Crop the map to range and Doppler cells around an echo, in all directions.
 
         Args:
             range_: Range of the echo [m].

@@ -22,18 +22,19 @@ from invertwin.scene.scene import Scene
 
 @dataclass(frozen=True)
 class FacetMap(ForwardModel):
-    """The power spectrum of a few flat conductors that mirror one another: |sum of fields|².
+    """Power spectrum of a few flat conductors that reflect one another: |sum of fields|².
 
-    Chains of a corner reflector add in phase, as in a ``SurrogateMap`` that names it ``coherent``,
-    which serves scenes with rough things, too. There are no samples and no speckle: the map is
-    smooth in the pose, corners and beams' edges included, as long as one chain or one corner
-    dominates each cell; echoes of several targets in one cell interfere, with a minimum every half
-    wavelength.
+    Fields of the facet paths of a corner reflector are added, as in a ``SurrogateMap`` that names
+    it ``coherent``, which also supports scenes with rough objects. The map uses no samples and has
+    no speckle. It is smooth in the pose, at corners and edges of beams too, if one path or one
+    corner reflector dominates each cell; echoes of several targets in one cell interfere, with a
+    minimum every half wavelength.
 
     Attributes:
         grid: Bins, see ``Radar.grid``.
-        surrogate: Extra widths, which are zero at the end of a fit; its kernels do not count.
-        sampling: Most bounces; nothing else counts.
+        surrogate: Additional blur widths, which are zero at the end of a fit; its kernels are not
+            used.
+        sampling: Maximum number of bounces; other values are not used.
     """
 
     grid: Grid
@@ -49,7 +50,7 @@ class FacetMap(ForwardModel):
         return exact_spectrum(beat, sensor, self.grid).to(torch.float32)
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
-        """The spectrum of the chains. See ``ForwardModel.predict`` and ``trace_facet_paths``."""
+        """Predict the spectrum of facet paths. See ``trace_facet_paths``."""
         return self.blur_observed(self._to_map(self._beat(scene, sensor), sensor), sensor)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range u v"]:
@@ -57,7 +58,7 @@ class FacetMap(ForwardModel):
         return recording.spectrum(self.grid).to(torch.float32)
 
     def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
-        """The map with other noise each time; None for waveforms without samples."""
+        """Return maps with independent noise; None for waveforms without samples."""
         if not isinstance(sensor.waveform, SampledWaveform):
             return None
         beat, to_map = self._beat(scene, sensor), partial(self._to_map, sensor=sensor)
@@ -69,22 +70,23 @@ class FacetMap(ForwardModel):
         return self.surrogate.has_blur
 
     def scale_blur(self, fraction: float) -> "FacetMap":
-        """The model with this share of its extra widths."""
+        """Scale the additional blur widths by a factor."""
         return replace(self, surrogate=self.surrogate.scale_blur(fraction))
 
     def blur_observed(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
-        """A map with the extra widths."""
+        """Blur a map by the additional widths."""
         return self.surrogate.blur(observed, sensor, self.grid)
 
 
 @dataclass(frozen=True)
 class FacetField(FacetMap):
-    """The complex range profiles of a few flat conductors that mirror one another.
+    """Complex range profiles of a few flat conductors that reflect one another.
 
-    The phase tells the range to parts of a wavelength. So its loss has a minimum every half
-    wavelength: it refines what a ``FacetMap`` has found to a tenth of a wavelength in range, in a
-    later stage of a fit. Maps hold real and imaginary parts; compare them by a ``SpectrumLoss`` of
-    kind ``mse`` with one level. The radar's phase is calibrated.
+    The phase determines the range to a fraction of a wavelength, and the loss has a minimum every
+    half wavelength. In a later stage of a fit, this model refines the result of a ``FacetMap``,
+    which is accurate to a tenth of a wavelength in range. Maps hold real and imaginary parts;
+    compare them by a ``SpectrumLoss`` of kind ``mse`` with one level. The radar's phase is
+    calibrated.
     """
 
     holds_fields: ClassVar[bool] = True
@@ -102,14 +104,14 @@ class FacetField(FacetMap):
         return super().predict(scene, sensor, seed)
 
     def observe(self, recording: Capture) -> Float[Tensor, "frame range channel part"]:
-        """The measured range profiles of a capture."""
+        """Return the measured range profiles of a capture."""
         return self._to_map(recording.beat, recording.radar())
 
     @property
     def has_blur(self) -> bool:
-        """Fields have no extra widths."""
+        """False: fields have no additional blur."""
         return False
 
     def blur_observed(self, observed: Tensor, sensor: Radar) -> Tensor:
-        """A map as it is."""
+        """Return the map unchanged."""
         return observed

@@ -33,20 +33,20 @@ class SurrogateMap(ForwardModel):
 
     Attributes:
         grid: Bins, see ``Radar.grid``.
-        surrogate: Kernels and extra widths, or a name among ``SURROGATES``.
+        surrogate: Kernels and additional blur widths, or a name among ``SURROGATES``.
         sampling: Sampling of paths.
         coherent: Names of coherent targets: smooth conductors of at most 24 triangles each, such as
-            corner reflectors, whose bounces add in field. A smooth conductor that is not named
-            is a narrow lobe, whose bounces add in power: a corner is then some 10 dB too weak.
-        stretch: Wavelength of the targets' phases at the start of a fit, in wavelengths of the
-            radar. Lobes of plates and dihedrals are wider by it, with the same peaks.
-        mirrors: Names of smooth flat objects, such as a wall or a floor, in which everything but
-            the coherent targets is seen a second time (ghosts): paths of up to ``sampling.depth``
-            surfaces that scatter once. A smooth surface that is not named is a lobe.
+            corner reflectors, whose bounces add in field. Other smooth conductors are narrow lobes
+            whose bounces add in power: a corner reflector is then some 10 dB too weak.
+        stretch: Initial wavelength of the targets' phases in a fit, in wavelengths of the radar. It
+            widens the lobes of plates and dihedrals by this factor and keeps their peaks.
+        mirrors: Names of smooth flat objects, such as a wall or a floor, that form mirror images
+            (ghosts) of everything except the coherent targets: paths of up to ``sampling.depth``
+            surfaces that scatter once. Other smooth surfaces are lobes.
 
     Raises:
-        InputError: An unknown name, or "exact", which is ``ExactMap``; a stretch below 1, or one
-            without targets.
+        InputError: An unknown name, or "exact", which is ``ExactMap``; a stretch below 1, or a
+            stretch without targets.
     """
 
     grid: channel.Grid
@@ -80,12 +80,12 @@ class SurrogateMap(ForwardModel):
 
     @property
     def kernels(self) -> surrogates.Surrogate:
-        """The surrogate as a value."""
+        """Kernels of the surrogate."""
         assert isinstance(self.surrogate, surrogates.Surrogate)
         return self.surrogate
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
-        """The expected power spectrum. See ``ForwardModel.predict``."""
+        """Predict the expected power spectrum. See ``ForwardModel.predict``."""
         reference = None
         if self._reference is not None:
             fixed, device, scheme = self._reference
@@ -97,10 +97,10 @@ class SurrogateMap(ForwardModel):
     def predict_batch(
         self, scenes: Sequence[Scene], sensor: Radar, seed: int
     ) -> Float[Tensor, "scene frame range u v"]:
-        """``predict`` of many scenes at once, in one launch: fast where samples are few.
+        """Predict maps of many scenes in one kernel launch, which is fast for few samples.
 
-        Gradients flow to every scene, and to the sensor. Scenes have nothing in common but the
-        sensor: they may share tensors, or have objects of their own. See ``deposit_batch``.
+        Maps are differentiable with respect to every scene and to the sensor. Scenes have only the
+        sensor in common: they may share tensors, or have different objects. See ``deposit_batch``.
 
         Args:
             scenes: Scenes to predict, such as the variants of one scene in a training step.
@@ -108,7 +108,7 @@ class SurrogateMap(ForwardModel):
             seed: Same seed and scenes, same maps.
 
         Raises:
-            InputError: No scenes, clouds, or a model made for differences.
+            InputError: No scenes, clouds, or a model for finite differences.
         """
         if self._reference is not None:
             raise InputError(
@@ -139,14 +139,14 @@ class SurrogateMap(ForwardModel):
     def for_differences(
         self, scene: Scene, sensor: Radar, samples: int, scheme: Literal["rays", "area"]
     ) -> "SurrogateMap":
-        """The model with sampling probabilities that belong to this scene."""
+        """Return the model with sampling probabilities of this scene."""
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
         return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
 
     def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
-        """Spectra of one scene with other speckle, and another phase of every coherent target.
+        """Return spectra of one scene with other speckle and other phases of coherent targets.
 
-        None for clouds and for smooth conductors that are no targets.
+        None for clouds and for smooth conductors that are not coherent targets.
         """
         whole = channel.as_absorbers(scene, self.coherent)
         rest = channel.without_specular(whole, self.mirrors)
@@ -180,31 +180,31 @@ class SurrogateMap(ForwardModel):
 
     @property
     def has_blur(self) -> bool:
-        """True if the surrogate blurs maps, or targets have a longer wavelength."""
+        """True if the surrogate blurs maps, or the phases of targets are stretched."""
         return self.kernels.has_blur or self.stretch > 1
 
     def scale_blur(self, fraction: float) -> "SurrogateMap":
-        """The surrogate with this share of its extra widths and of its stretch beyond 1."""
+        """Scale the additional blur widths, and the stretch beyond 1, by a factor."""
         stretch = 1 + (self.stretch - 1) * fraction
         return replace(self, surrogate=self.kernels.scale_blur(fraction), stretch=stretch)
 
     def blur_observed(self, observed: Tensor, sensor: Radar) -> Float[Tensor, "frame range u v"]:
-        """A measured spectrum with the extra widths."""
+        """Blur a measured spectrum by the additional widths."""
         return self.kernels.blur(observed, sensor, self.grid)
 
 
 @dataclass(frozen=True)
 class ExactMap(ForwardModel):
-    """The power spectrum of one realisation, as the radar itself computes it.
+    """Power spectrum of one realisation, by the radar's own processing.
 
     Its loss has a minimum every half wavelength, and rough surfaces need
-    ``Sampling(boundary=False)``. It serves comparisons and data.
+    ``Sampling(boundary=False)``. Use it for comparisons and data.
 
     Attributes:
         grid: Bins, see ``Radar.grid``.
         sampling: Sampling of paths.
-        speckle: Rough points and paths with their phases, which are unknown for real data; None =
-            drawn from the seed.
+        speckle: Points of rough surfaces and paths with their phases, which are unknown for
+            measured data; None = drawn from the seed.
     """
 
     grid: channel.Grid
@@ -215,7 +215,7 @@ class ExactMap(ForwardModel):
     is_smooth: ClassVar[bool] = False
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
-        """The spectrum of the exact beat signals. See ``ForwardModel.predict``."""
+        """Predict the spectrum of the exact beat signals. See ``ForwardModel.predict``."""
         found = simulate(
             scene, sensor, self.grid, seed=seed, sampling=self.sampling, speckle=self.speckle
         )
@@ -228,14 +228,14 @@ class ExactMap(ForwardModel):
     def with_sampling(self, **changes: Any) -> "ForwardModel":
         """Return the model with other fields of its ``sampling``.
 
-        ``samples`` is the work for a map in every model; here it is that of conductors.
+        ``samples`` is the number of samples of conductors here.
         """
         if "samples" in changes:
             changes["conductor_samples"] = changes.pop("samples")
         return super().with_sampling(**changes)
 
     def prepare(self, scene: Scene, sensor: Radar, seed: int) -> "ExactMap":
-        """The model with rough points that stay while the scene moves."""
+        """Return the model with fixed points of rough surfaces."""
         if self.speckle is not None:
             return self
         speckle = channel.draw_speckle(scene, sensor.link(), self.sampling, seed)
@@ -244,46 +244,46 @@ class ExactMap(ForwardModel):
 
 @dataclass(frozen=True)
 class BeatMap(ExactMap):
-    """The exact beat signals themselves, before any spectrum. They are complex.
+    """Exact complex beat signals, before any spectrum.
 
     Attributes:
-        channels: Transmitters and receivers whose signals are shown.
+        channels: Slices of transmitters and receivers of the map.
     """
 
     channels: tuple[slice, slice] = (slice(None), slice(None))
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Tensor:
-        """The beat signals [frame, tx, rx, sample]. See ``ForwardModel.predict``."""
+        """Predict beat signals [frame, tx, rx, sample]. See ``ForwardModel.predict``."""
         paths = channel.trace_field(
             scene, sensor.link(), sampling=self.sampling, seed=seed, speckle=self.speckle
         )
         return beat_signal(paths, sensor, channels=self.channels)
 
     def observe(self, recording: Capture) -> Tensor:
-        """The recorded beat signals of these channels."""
+        """Return the recorded beat signals of these channels."""
         return recording.beat[(slice(None), *self.channels)]
 
 
 def surrogate_correlation(
     scene: Scene, radar: Radar, model: SurrogateMap, *, seed: int, realisations: int = 16
 ) -> float:
-    """Correlation of a surrogate's map with the mean exact spectrum over several looks.
+    """Correlation of a surrogate's map with the mean exact spectrum over several realisations.
 
-    A look has its own phases of the rough surfaces. One look has speckle as strong as the map
-    itself. A scene of conductors has no speckle: all its looks are equal.
+    Each realisation has its own phases of the rough surfaces. One realisation has speckle as strong
+    as the map itself. A scene of conductors has no speckle: all its realisations are equal.
 
     Args:
         scene: Scene to trace.
         radar: Arrays, waveform and poses.
-        model: The surrogate; its ``sampling`` serves the exact spectra too.
-        seed: Seed of the first look, and of the surrogate's samples.
-        realisations: Exact spectra that are averaged.
+        model: Surrogate model; its ``sampling`` is also used for the exact spectra.
+        seed: Seed of the first realisation, and of the surrogate's samples.
+        realisations: Number of averaged exact spectra.
 
     Returns:
-        Pearson's correlation over all bins and frames; 0 where a map is constant.
+        Pearson correlation over all bins and frames; 0 if a map is constant.
 
     Raises:
-        InputError: No looks.
+        InputError: No realisations.
     """
     checked_count(realisations, "realisations", 1)
     if all(item.material.coherent for item in scene.objects.values()):

@@ -25,12 +25,12 @@ from invertwin.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class PanelMap(ForwardModel):
-    """The path gain of receivers over a metasurface alone; the sensor is the metasurface.
+    """Path gain of receivers over a metasurface alone; the sensor is the metasurface.
 
     Attributes:
-        tx: The transmitter [m].
-        receivers: [rx, 3] [m].
-        frequency: [Hz].
+        tx: Position of the transmitter [3] [m].
+        receivers: Positions of the receivers [rx, 3] [m].
+        frequency: Carrier frequency [Hz].
         boundary: False leaves out of derivatives that shadows move over the panel.
     """
 
@@ -43,18 +43,18 @@ class PanelMap(ForwardModel):
     is_random: ClassVar[bool] = False
 
     def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 rx"]:
-        """|Σ|² of the elements. See ``panel_response``."""
+        """Predict |Σ|² of the elements. See ``panel_response``."""
         found = panel_response(
             scene, sensor, self.tx[None], self.receivers, self.frequency, boundary=self.boundary
         )
         return found.real.square() + found.imag.square()
 
     def observe(self, recording: Tensor) -> Float64[Tensor, "1 rx"]:
-        """Measured path gains, over the panel alone."""
+        """Return measured path gains over the panel alone."""
         return recording.reshape(1, -1)
 
     def ablations(self) -> dict[str, ForwardModel]:
-        """The model at fixed shadows. See ``ForwardModel.ablations``."""
+        """Return the model at fixed shadows. See ``ForwardModel.ablations``."""
         return {"boundary": replace(self, boundary=False)} if self.boundary else {}
 
 
@@ -62,13 +62,13 @@ class PanelMap(ForwardModel):
 class CoverageMap(ForwardModel):
     """Path loss that the worst share of receivers exceeds [dB]; the sensor is the metasurface.
 
-    A map of one value: an aim to be lowered, compared by ``RatioLoss``.
+    The map is one value, an objective that is minimised by ``RatioLoss``.
 
     Attributes:
-        coverage: Receivers, and the path gain of each without a panel.
-        batch: Receivers of one prediction; the seed draws them.
-        blur: Width that is added to ends of shadows on the panel [m]; a fit takes it away.
-        softness: Width of the quantile, see ``soft_quantile`` [dB]; a tenth is left in the end.
+        coverage: Receivers with their path gains without a panel.
+        batch: Number of receivers per prediction, drawn by the seed.
+        blur: Additional width of penumbras on the panel [m]; removed during a fit.
+        softness: Width of the quantile, see ``soft_quantile`` [dB]; a tenth remains at the end.
         boundary: False leaves out of derivatives that shadows move over the panel.
     """
 
@@ -79,14 +79,14 @@ class CoverageMap(ForwardModel):
     boundary: bool = True
 
     def predict(self, scene: Scene, sensor: Metasurface, seed: int) -> Float64[Tensor, "1 1"]:
-        """See ``ForwardModel.predict``; what is in the way is that of ``coverage``."""
+        """Predict the path loss; objects that occlude paths are those of ``coverage``."""
         generator = torch.Generator().manual_seed(seed)
         chosen = torch.randperm(len(self.coverage.receivers), generator=generator)[: self.batch]
         some = self.coverage.part(chosen)
         return -some.aim(sensor, self.blur, self.boundary, self.softness).reshape(1, 1)
 
     def observe(self, recording: ArrayLike) -> Float64[Tensor, "1 1"]:
-        """A path loss to compare with [dB]."""
+        """Return a reference path loss [dB]."""
         return torch.as_tensor(recording, dtype=torch.float64).reshape(1, 1)
 
     @property
@@ -95,7 +95,7 @@ class CoverageMap(ForwardModel):
         return self.blur > 0 or self.softness > 0
 
     def scale_blur(self, fraction: float) -> "CoverageMap":
-        """The model with this fraction of its blur."""
+        """Scale the blur by a factor."""
         soft = self.softness * 0.1 ** (1 - fraction)
         return replace(self, blur=fraction * self.blur, softness=soft)
 
@@ -106,27 +106,27 @@ QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
 
 @dataclass(frozen=True, eq=False)
 class RadioMap(ForwardModel):
-    """Levels or gains at known receiver locations, a map for each transmitter.
+    """Levels or gains at known receiver locations, one map per transmitter.
 
     Levels are in decibels; compare them by ``SpectrumLoss(levels=1, gain="one")``, with
-    ``background="level"`` where the sent power is not known. A floor is added to every gain, so
-    that levels and derivatives are finite where no path leads.
+    ``background="level"`` if the transmitted power is unknown. A floor is added to every gain, so
+    levels and derivatives are finite without a path.
 
     Attributes:
         places: Positions of the receivers.
         propagation: Settings of the path search and of the sum over paths.
-        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain``: the same as a ratio
-            without a floor, ``sinr`` [dB]: received power of a transmitter over that of all others
-            and noise, or ``delay_spread`` [s].
-        floor_db: Path gain that is added to every one [dB].
+        quantity: ``received_power`` [dBm], ``path_gain`` [dB], ``gain`` (path gain as a ratio,
+            without a floor), ``sinr`` [dB] (received power of a transmitter over that of all others
+            and noise), or ``delay_spread`` [s].
+        floor_db: Path gain that is added to every gain [dB].
         noise_dbm: Noise power of a receiver, for ``sinr`` [dBm].
-        scatter: Standard deviation of data about the map, in its unit, where it is known. Error
-            bars and verdicts draw from it; None = as large as what a fit leaves unexplained.
-        without: Names of objects that the model leaves out. In a first, coarse stage of a fit, what
-            hides a transmitter would keep it from where it belongs.
+        scatter: Standard deviation of data about the map, in the unit of the map, used by error
+            bars and verdicts; None = estimated from the residual of a fit.
+        without: Names of objects that the model leaves out. In a first, coarse stage of a fit, an
+            object that hides the transmitter would keep it from its true position.
 
     Raises:
-        InputError: An unknown quantity, or a number out of range.
+        InputError: An unknown quantity, or a value out of range.
     """
 
     places: ReceiverLocations
@@ -148,7 +148,7 @@ class RadioMap(ForwardModel):
         checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
 
     def link_statistics(self, scene: Scene, sensor: Transmitters, seed: int) -> LinkStatistics:
-        """Gain and delay spread, before any decibels.
+        """Gain and delay spread in linear units.
 
         Args:
             scene: Propagation environment.
@@ -156,7 +156,7 @@ class RadioMap(ForwardModel):
             seed: Seed of the rays that find paths.
 
         Raises:
-            InputError: No object of a name that is left out.
+            InputError: An unknown name in ``without``.
         """
         if self.without:
             unknown = sorted(set(self.without) - set(scene.names))
@@ -171,7 +171,7 @@ class RadioMap(ForwardModel):
         return self.places.link_statistics(scene, sensor, self.propagation, seed)
 
     def predict(self, scene: Scene, sensor: Transmitters, seed: int) -> Float64[Tensor, "tx *map"]:
-        """The quantity of every transmitter. See ``ForwardModel.predict``."""
+        """Predict the quantity of every transmitter. See ``ForwardModel.predict``."""
         found = self.link_statistics(scene, sensor, seed)
         if self.quantity == "delay_spread":
             return found.delay_spread
@@ -186,7 +186,7 @@ class RadioMap(ForwardModel):
         return 10 * power.log10()
 
     def observe(self, recording: ArrayLike) -> Float64[Tensor, "tx *map"]:
-        """Measured values [tx, …], or those of a single transmitter […].
+        """Return measured values [tx, …], or those of a single transmitter […].
 
         Raises:
             InputError: Another shape, or NaN.
@@ -197,11 +197,11 @@ class RadioMap(ForwardModel):
         return checked_tensor(given, (None, *shape), what, "give a map for each transmitter")
 
     def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
-        """The map with other errors of measurement each time."""
+        """Return maps with independent measurement errors."""
         return self.realisations_about(self.predict(scene, sensor, seed))
 
     def realisations_about(self, mean: Float64[Tensor, "tx *map"]) -> Realisations:
-        """A map with other errors of measurement each time, see ``ForwardModel.realisations``.
+        """Return maps with independent measurement errors, see ``ForwardModel.realisations``.
 
         Args:
             mean: The map without errors.
@@ -209,7 +209,7 @@ class RadioMap(ForwardModel):
         return add_white_errors(mean, self.scatter)
 
     def best_server(self, scene: Scene, sensor: Transmitters, seed: int) -> Int64[Tensor, "*map"]:
-        """Number of the transmitter of which most power arrives; −1 where none arrives.
+        """Index of the transmitter with the highest received power; −1 if no power arrives.
 
         Args:
             scene: Propagation environment.
@@ -228,14 +228,14 @@ class RadioMap(ForwardModel):
     def for_differences(
         self, scene: Scene, sensor: Transmitters, samples: int, scheme: Literal["rays", "area"]
     ) -> "RadioMap":
-        """The model with so many points on the cells, and so many scattered paths."""
+        """Return the model with other numbers of points on cells and of scattered paths."""
         reception, rough = self.propagation, self.propagation.rough
         if rough is not None:
             reception = replace(reception, rough=replace(rough, samples=samples, boundary=False))
         return replace(self, places=self.places.with_sample_count(samples), propagation=reception)
 
     def ablations(self) -> dict[str, ForwardModel]:
-        """The model at fixed visibility: without diffraction, or without boundary paths of cells.
+        """Return the model at fixed visibility: without diffraction or boundary paths of cells.
 
         See ``ForwardModel.ablations``.
         """
@@ -254,18 +254,19 @@ class RadioMap(ForwardModel):
 
 @dataclass(frozen=True, eq=False)
 class ResponseMap(ForwardModel):
-    """Complex responses H(f) between transmitters and receivers at known places.
+    """Complex responses H(f) between transmitters and receivers at known positions.
 
-    Their phase tells the length of paths to parts of a wavelength, so that the loss has a minimum
-    every half wavelength of a place. Materials, which hardly turn phases, are found from anywhere.
-    Maps hold real and imaginary parts; compare them by ``SpectrumLoss(levels=1, gain="one")``.
+    Phases determine path lengths to a fraction of a wavelength, so the loss has a minimum every
+    half wavelength of position. Materials hardly change phases and are found from any initial
+    value. Maps hold real and imaginary parts; compare them by
+    ``SpectrumLoss(levels=1, gain="one")``.
 
     Attributes:
-        positions: Positions of the receivers, [place, 3] [m].
+        positions: Positions of the receivers [receiver, 3] [m].
         frequencies: Frequencies of the responses [Hz].
-        propagation: Settings of the path search; its bandwidth does not count.
-        scatter: Standard deviation of data about the map, of each part; None = as large as what a
-            fit leaves unexplained.
+        propagation: Settings of the path search; its bandwidth is ignored.
+        scatter: Standard deviation of the real and imaginary parts of data about the map; None =
+            estimated from the residual of a fit.
     """
 
     positions: Float64[Tensor, "place 3"]
@@ -285,14 +286,14 @@ class ResponseMap(ForwardModel):
     def predict(
         self, scene: Scene, sensor: Transmitters, seed: int
     ) -> Float64[Tensor, "tx place frequency part"]:
-        """The responses of the first elements. See ``ForwardModel.predict``."""
+        """Predict the responses of the first elements. See ``ForwardModel.predict``."""
         found = self.propagation.frequency_responses(
             scene, sensor, self.positions, self.frequencies, seed
         )
         return torch.view_as_real(found)
 
     def observe(self, recording: Tensor) -> Float64[Tensor, "tx place frequency part"]:
-        """Measured complex responses [tx, place, frequency].
+        """Return measured complex responses [tx, receiver, frequency].
 
         Raises:
             InputError: Another shape, or NaN.
@@ -303,5 +304,5 @@ class ResponseMap(ForwardModel):
         return checked_tensor(torch.view_as_real(given), shape, "measured responses", do)
 
     def realisations(self, scene: Scene, sensor: Transmitters, seed: int) -> Realisations:
-        """The responses with other noise each time."""
+        """Return responses with independent noise."""
         return add_white_errors(self.predict(scene, sensor, seed), self.scatter)

@@ -27,12 +27,11 @@ class RcsMap(ForwardModel):
         frequencies: Frequencies [Hz].
         receivers: Unit vectors to the receiver, [aspect, 3]; None = monostatic.
         polarisation: "V", "H", or a Jones vector.
-        depth: Largest number of bounces.
-        edges: Largest number of edges that diffract one after another.
+        depth: Maximum number of bounces.
+        edges: Maximum number of successive edge diffractions.
         tubes_per_wavelength: Ray tubes per wavelength.
         up: Direction of vertical polarisation.
-        boundary: False leaves out of derivatives what moving edges of beams and shadows change,
-            for ablation.
+        boundary: False = derivatives without moving edges of beams and shadows, for ablation.
         compute: Function (scene, boundary) → ``Signature`` in place of ``invertwin.rcs``.
 
     Raises:

@@ -17,7 +17,7 @@ _NOISE_ALONE = 1e9  # of the background: no echo is seen beside it
 
 @dataclass(frozen=True, eq=False)
 class WhitenedMap(ForwardModel):
-    """Maps of another model over a background: the mean power of objects that it lacks.
+    """Maps of another model divided by a background, the mean power of unmodelled objects.
 
     Observed and predicted maps are divided by the background B of each bin, relative to its mean.
     The likelihood of power b then is that of the mean g a + n B, with one level n for all bins.
@@ -46,25 +46,25 @@ class WhitenedMap(ForwardModel):
         return getattr(self.model, "sampling", None)
 
     def predict(self, scene: Scene, sensor: Any, seed: int) -> Float[Tensor, "frame *map"]:
-        """The whitened map. See ``ForwardModel.predict``."""
+        """Predict the whitened map. See ``ForwardModel.predict``."""
         return self._whiten(self.model.predict(scene, sensor, seed), sensor)
 
     def observe(self, recording: Any) -> Float[Tensor, "frame *map"]:
-        """The measured map, whitened without blur."""
+        """Return the measured map, whitened without blur."""
         observed = self.model.observe(recording)
         check_shape(self.background, observed.shape, "a background like the map", "use one grid")
         return observed / self._relative(self.background)
 
     def with_sampling(self, **changes: Any) -> "WhitenedMap":
-        """The model with other fields of its ``sampling``."""
+        """Return the model with other fields of its ``sampling``."""
         return replace(self, model=self.model.with_sampling(**changes))
 
     def prepare(self, scene: Scene, sensor: Any, seed: int) -> "WhitenedMap":
-        """The model with everything drawn that stays the same during a fit."""
+        """Return the model with the random numbers that are fixed during a fit."""
         return replace(self, model=self.model.prepare(scene, sensor, seed))
 
     def realisations(self, scene: Scene, sensor: Any, seed: int) -> Realisations | None:
-        """Whitened recordings of the twin, in which clutter is noise of its power."""
+        """Return whitened recordings of the twin; clutter is noise of the same power."""
         inner = self.model.realisations(scene, sensor, seed)
         if inner is None:
             return None
@@ -86,11 +86,11 @@ class WhitenedMap(ForwardModel):
         return self.model.has_blur
 
     def scale_blur(self, fraction: float) -> "WhitenedMap":
-        """The model with this share of its extra widths."""
+        """Scale the additional blur widths by a factor."""
         return replace(self, model=self.model.scale_blur(fraction))
 
     def blur_observed(self, observed: Tensor, sensor: Any) -> Float[Tensor, "frame *map"]:
-        """A whitened map with the model's extra widths, whitened by the blurred background."""
+        """Blur a whitened map by the model's widths, whitened by the blurred background."""
         power = observed * self._relative(self.background)
         return self._whiten(self.model.blur_observed(power, sensor), sensor)
 

@@ -92,17 +92,17 @@ class ShapeParameters:
 
     @property
     def is_rectangular(self) -> bool:
-        """True if its footprint is a rectangle with a yaw."""
+        """True if the footprint is a rectangle with a yaw."""
         return self.kind in _RECTANGULAR_KINDS
 
     @property
     def has_yaw(self) -> bool:
-        """True if it has a yaw."""
+        """True if the shape has a yaw."""
         return self.is_rectangular or self.kind == "corner"
 
     @property
     def has_free_height(self) -> bool:
-        """True if it may be above the ground."""
+        """True if the shape may be above the ground."""
         return self.kind in _FREE_HEIGHT_KINDS
 
     @property
@@ -225,7 +225,7 @@ class PrimitiveModel(UnknownShape):
 
     @property
     def shape(self) -> ShapeParameters:
-        """Return its present shape parameters."""
+        """Return the current shape parameters."""
         length, width, height = self.sides.detach().tolist()
         x, y = self.place.detach().tolist()
         if self.round:

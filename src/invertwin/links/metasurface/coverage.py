@@ -1,4 +1,4 @@
-"""Coverage of a room with a metasurface: the level that its worst receivers get."""
+"""Coverage of a room with a metasurface: the level of its worst receivers."""
 
 from dataclasses import dataclass, replace
 
@@ -17,9 +17,9 @@ _FLOOR = 1e-20  # path gain that is added, so that decibels stay finite
 
 
 def soft_quantile(values: Float64[Tensor, " n"], share: float, width: float) -> Float64[Tensor, ""]:
-    """The level that a share of values is below, smooth in all of them.
+    """Smooth quantile: the level below which a share of the values lies.
 
-    It solves mean σ((q − v)/width) = share; width 0 gives the quantile itself.
+    The level q solves mean σ((q − v)/width) = share; width 0 gives the exact quantile.
 
     Args:
         values: Values, at least one.
@@ -75,7 +75,7 @@ class Coverage:
         edges: int = 1,
         seed: int = 0,
     ) -> "Coverage":
-        """With the paths that are there without a panel.
+        """Trace the paths of the scene without a panel.
 
         Args:
             scene: Propagation environment.
@@ -100,25 +100,25 @@ class Coverage:
 
         Args:
             panel: The metasurface.
-            width: Added to the width over which shadows end on it [m].
-            boundary: False leaves out of derivatives that shadows move.
+            width: Additional width of penumbras on the panel [m].
+            boundary: False = derivatives at fixed visibility.
         """
         link = self.tx[None], self.receivers, self.frequency
         over = panel_response(self.scene, panel, *link, blur=width, boundary=boundary)[0]
         return self.direct + over.real.square() + over.imag.square()
 
     def part(self, rows: Tensor | slice) -> "Coverage":
-        """Some of the receivers.
+        """Select some of the receivers.
 
         Args:
-            rows: Their numbers.
+            rows: Indices of the receivers.
         """
         return replace(self, receivers=self.receivers[rows], direct=self.direct[rows])
 
     def aim(
         self, panel: Metasurface, width: float = 0.0, boundary: bool = True, softness: float = 0.0
     ) -> Float64[Tensor, ""]:
-        """``worst`` of ``gain``; receivers that get much without the panel stay without.
+        """Return ``worst`` of ``gain``; receivers with a high level are taken without the panel.
 
         Args:
             panel: The metasurface.
@@ -130,7 +130,7 @@ class Coverage:
         return self.worst(self.direct.masked_scatter(weak, gain), softness)
 
     def worst(self, gain: Tensor, softness: float = 0.0) -> Float64[Tensor, ""]:
-        """The level that the worst share of receivers is below [dB].
+        """Level below which the worst share of receivers lies [dB].
 
         Args:
             gain: Result of ``gain``.

@@ -31,22 +31,23 @@ _MAX_BITS = 8
 
 @dataclass(frozen=True, eq=False)
 class Metasurface:
-    """A flat panel of equal elements in rows and columns, which scatters in front of it.
+    """Flat panel of equal elements in rows and columns, which scatters into its front half space.
 
-    It is no object of the scene: it blocks nothing, and what lies behind it mirrors as without it.
+    A panel is not an object of the scene: it blocks nothing, and surfaces behind it reflect as if
+    it were absent.
 
     Attributes:
-        position: Position of its centre [m].
-        axes: Columns are its normal and its y and z axes, in the world.
-        phase: Phases of the elements along y and z [rad]; 0 = a mirror that inverts the field.
-        spacing: Distance of elements along y and z [m]; a cell is as large. Half a wavelength
-            and less sum up to the integral over a plate.
-        amplitude: Amplitude of all elements, or one for each; 1 = the cell scatters all power that
-            falls on it.
-        bits: Phases are rounded to 2^bits values; derivatives pass straight through. None does not
-            round.
-        pattern: Pattern of an element about its normal. None is that of an aperture, ½(cosθ_t +
-            cosθ_r), which ends at once behind the panel's plane.
+        position: Centre of the panel [3] [m].
+        axes: Rotation matrix [3, 3]; columns are the normal, the y and the z axis in the world.
+        phase: Phases of the elements along y and z [rad]; 0 = a reflector that inverts the field.
+        spacing: Element spacing along y and z, and size of an element's cell [m]. With half a
+            wavelength or less, the sum equals the integral over a plate.
+        amplitude: Amplitude of all elements, or one for each; 1 = the cell scatters all incident
+            power.
+        bits: Number of bits to which phases are rounded, with the straight-through estimator for
+            derivatives; None = not rounded.
+        pattern: Pattern of an element about its normal. None = aperture pattern ½(cosθ_t + cosθ_r),
+            which is cut off at the panel's plane.
 
     Raises:
         InputError: Wrong shapes, axes that are not orthonormal, or a number out of range.
@@ -84,7 +85,7 @@ class Metasurface:
 
     @property
     def cells(self) -> channel.PanelCells:
-        """The cells of the elements; y runs slowest."""
+        """Cells of the elements, in row-major order of (y, z)."""
         offsets = [
             (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
             for count in self.phase.shape
@@ -105,11 +106,11 @@ class Metasurface:
     def focus(
         self, tx: checks.ArrayLike, target: checks.ArrayLike, frequency: float
     ) -> "Metasurface":
-        """The panel with phases that focus a transmitter on a point, added to its own.
+        """Return the panel with additional phases that focus a transmitter on a point.
 
         Args:
-            tx: Place of the transmitter [m].
-            target: The point [m].
+            tx: Position of the transmitter [3] [m].
+            target: Focal point [3] [m].
             frequency: [Hz].
         """
         do = "give x, y, z"
@@ -130,18 +131,18 @@ def panel_response(
     boundary: bool = True,
     far_field: bool = False,
 ) -> Complex128[Tensor, "tx rx"]:
-    """The sum over a panel's elements for fields that a mirror keeps, isotropic antennas.
+    """Sum over a panel's elements for fields unchanged by a reflector, with isotropic antennas.
 
-    Its phase is that over the phase of the path by the panel's centre, ``e^{−jk(R₁+R₂)}``.
+    The phase is relative to that of the path over the panel's centre, ``e^{−jk(R₁+R₂)}``.
 
     Args:
         scene: Propagation environment.
         panel: The metasurface.
         tx, rx: Places of the antennas [m].
         frequency: [Hz].
-        blur: Added to the width over which shadows end on the panel [m].
-        boundary: False leaves out of derivatives that shadows move over the panel.
-        far_field: Waves are plane over the panel: quicker, right beyond 2D²/λ.
+        blur: Additional width of penumbras on the panel [m].
+        boundary: False = derivatives at fixed visibility of the panel.
+        far_field: True = plane waves over the panel: faster, accurate beyond 2D²/λ.
     """
     cells, k = panel.cells, 2 * math.pi * frequency / SPEED_OF_LIGHT
     lit = channel.visible_fractions(scene, torch.cat([tx, rx]), cells, blur=blur, boundary=boundary)
@@ -211,22 +212,22 @@ def panel_paths(
     boundary: bool = True,
     far_field: bool = False,
 ) -> channel.RayPaths:
-    """Paths over metasurfaces: one for each panel and link, whose coefficient sums up its elements.
+    """Paths over metasurfaces: one per panel and link, with the sum over its elements.
 
-    They have the delay of the way by the panel's centre, and polarisation as a mirror there. Add
-    them to those of ``trace_paths`` with ``+``: all then sum up coherently. Antennas are at rest.
-    From the panel to the antennas waves go straight, unless something is in the way.
+    Paths have the delay of the path over the panel's centre, and the polarisation of a reflector
+    there. Add them to those of ``trace_paths`` by ``+``; responses then sum all paths coherently.
+    Antennas are at rest. Paths between panel and antennas are straight and may be occluded.
 
     Args:
         scene: Propagation environment.
-        panels: One or several; each sees the antennas, none sees another.
+        panels: One or several metasurfaces, without paths between them.
         tx: Transmitters, [3] or [tx, 3] in the world [m].
         rx: Receivers, [3] or [rx, 3] [m].
         frequency: Frequency of the coefficients [Hz].
-        blur: Added to the width over which shadows end on a panel [m]; more than 0 smooths the
-            landscape of a fit.
-        boundary: False leaves out of derivatives that shadows move over panels, for ablation.
-        far_field: Waves are plane over a panel: quicker, right beyond 2D²/λ.
+        blur: Additional width of penumbras on a panel [m]; a positive value smooths the loss of a
+            fit.
+        boundary: False = derivatives at fixed visibility of the panels, for ablation.
+        far_field: True = plane waves over a panel: faster, accurate beyond 2D²/λ.
 
     Raises:
         InputError: Wrong shapes or numbers, or an antenna within a spacing of a panel.

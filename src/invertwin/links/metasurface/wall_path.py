@@ -30,20 +30,21 @@ class _PathSegment:
 
 
 class WallPath:
-    """A level path along walls, with the room on its left; corners are rounded.
+    """Horizontal path along walls, with the room on its left and rounded corners.
 
     Args:
-        corners: Corners of the walls' plan, [corner, 2], as far off the walls as a panel needs [m].
+        corners: Corners of the path [corner, 2], at the distance from the walls that a panel
+            requires [m].
         height: z of the path [m].
-        radius: Radius of round corners [m].
-        closed: Whether the last corner leads back to the first.
+        radius: Radius of the rounded corners [m].
+        closed: True if the last corner is connected to the first.
 
     Attributes:
-        length: [m].
-        closed: As given.
+        length: Length of the path [m].
+        closed: See Args.
 
     Raises:
-        InputError: Fewer than two corners, or a wall that is too short for the round corners.
+        InputError: Fewer than two corners, or a wall that is too short for the rounded corners.
     """
 
     def __init__(
@@ -69,11 +70,11 @@ class WallPath:
     def locate(
         self, distance: Float64[Tensor, ""]
     ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
-        """Position [m], and the unit vector into the room.
+        """Compute the position [m] at a path length, and the unit vector into the room.
 
         Args:
-            distance: Length of the path up to here [m]; beyond the ends of an open path it goes
-                straight on, a closed one is gone round again.
+            distance: Path length from the start [m]; an open path is extended straight beyond its
+                ends, a closed path is periodic.
         """
         if self.closed:
             distance = distance - self.length * math.floor(float(distance.detach()) / self.length)
@@ -125,28 +126,29 @@ def _build_segments(points: Tensor, radius: float, closed: bool) -> list[_PathSe
 
 
 class PanelPlacement(nn.Module):
-    """A module Metasurface → Metasurface: its position along walls, its yaw, and its focus.
+    """Module Metasurface → Metasurface: position along walls, yaw and focus of a panel.
 
-    Phases are those of a focus that stays where it is when the panel moves, widened by a quadratic
-    term, plus a shift of each element. The derivative with respect to the position holds that of
-    the focus. Values that leave their ranges in a step end on the border.
+    Phases are the sum of a focus that stays in place as the panel moves, a quadratic term that
+    widens the beam, and a shift of each element. The derivative with respect to the position
+    includes the phases of the focus. Values that leave their ranges in a step are clamped to the
+    limits.
 
     Args:
         path: Path along the walls.
-        tx: The transmitter that is focused [m].
-        target: Point on which it is focused [m].
+        tx: Position of the focused transmitter [3] [m].
+        target: Focal point [3] [m].
         frequency: [Hz].
-        counts: Elements along y and z whose own phases are fitted; None = of none: those are
-            the matter of ``ElementPhases``.
-        along: Place on the path at the start [m].
-        yaw: Turn about the vertical away from the wall's normal, at the start [rad].
-        spread: Half widths of the beam, across and up, at the start [rad].
-        yaw_limit: Largest turn away from the wall's normal [rad].
-        spread_limit: Largest half width of the beam [rad].
+        counts: Numbers of elements along y and z whose phases are fitted; None = no element phases,
+            see ``ElementPhases``.
+        along: Initial position along the path [m].
+        yaw: Initial rotation about the vertical, from the wall's normal [rad].
+        spread: Initial half widths of the beam, horizontal and vertical [rad].
+        yaw_limit: Maximum rotation from the wall's normal [rad].
+        spread_limit: Maximum half width of the beam [rad].
 
     Attributes:
         along, yaw, spread: Parameters.
-        shift: Parameter, [y, z] of the elements [rad], where ``counts`` are given.
+        shift: Parameter [y, z], phases of the elements [rad], if ``counts`` are given.
 
     Raises:
         InputError: Wrong shapes or numbers.
@@ -183,7 +185,7 @@ class PanelPlacement(nn.Module):
             self.shift = _zero_phases(counts)
 
     def forward(self, panel: Metasurface) -> Metasurface:
-        """The panel where it stands, with its phases."""
+        """Return the panel at its position, with its phases."""
         with torch.no_grad():
             for name, limit in self._limits.items():
                 getattr(self, name).data.clamp_(-limit, limit)
@@ -203,7 +205,7 @@ class PanelPlacement(nn.Module):
         return placed.focus(self._tx, self._target, self._frequency)
 
     def values(self) -> dict[str, Tensor]:
-        """Place [m], yaw and spread [rad] by name, for progress and reports."""
+        """Position [m], yaw and spread [rad] by name, for progress and reports."""
         named = {"along": self.along, "yaw": self.yaw, "spread": self.spread}
         return {f"panel.{name}": value.detach().clone() for name, value in named.items()}
 
@@ -214,13 +216,13 @@ def _zero_phases(counts: Sequence[int]) -> nn.Parameter:
 
 
 class ElementPhases(nn.Module):
-    """A module Metasurface → Metasurface that adds a phase to each element.
+    """Module Metasurface → Metasurface that adds a phase to each element.
 
     Args:
-        counts: Elements along y and z.
+        counts: Numbers of elements along y and z.
 
     Attributes:
-        shift: Parameter, [y, z] [rad].
+        shift: Parameter [y, z], phases of the elements [rad].
     """
 
     def __init__(self, counts: Sequence[int]) -> None:
@@ -228,5 +230,5 @@ class ElementPhases(nn.Module):
         self.shift = _zero_phases(counts)
 
     def forward(self, panel: Metasurface) -> Metasurface:
-        """The panel with its phases shifted."""
+        """Return the panel with shifted phases."""
         return replace(panel, phase=panel.phase + self.shift)
