@@ -1,6 +1,6 @@
-"""Files from strangers: every reader works in here, and what it cannot read is one line.
+"""Untrusted files: a context of all readers that turns any failure into an error of one line.
 
-What can hang or crash its reader is read by a child process: `apart.py`.
+A file that can hang or crash its reader is read by a child process: `isolated_reader.py`.
 """
 
 from collections.abc import Callable, Collection, Iterator
