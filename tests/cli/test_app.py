@@ -170,7 +170,7 @@ def test_gradcheck_of_several_files(run_file, monkeypatch, capsys):
     assert {p.name for p in out.iterdir()} >= {"first.png", "runs", "report.html"}
     said = " ".join(capsys.readouterr().out.split())
     assert "second" in said
-    assert "2 for a right gradient" in said
+    assert "2 for a correct derivative" in said
 
 
 @pytest.mark.parametrize("gone", ["full", "closed", "pipe"])

@@ -230,7 +230,7 @@ def test_ends_that_scatter_beyond_the_bars_are_told(tmp_path, ends, near, inside
 def test_bars_of_a_fit_that_the_data_speak_against_are_not_stated_as_if_they_held(word, hold):
     bars = {"standard_deviations": {"x": 0.01}, "within_95": {"x": 0.02}, "units": {"x": "m"}}
     note = error_bar_table({**bars, "verdict": word}).note
-    assert ("hold only as far as the model does" in note) != hold
+    assert ("only as valid as the model" in note) != hold
     assert ("near the minimum that was found" in note) == hold
 
 
