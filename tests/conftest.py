@@ -39,6 +39,17 @@ DATA = Path(os.environ.setdefault("INVERTWIN_TEST_DATA", GIVEN))
 os.environ["INVERTWIN_DATA"] = str(REPOSITORY / "no measured data: ask for the fixture data_folder")
 
 
+def pytest_configure() -> None:
+    """Make the device of `claimed_tensors` known to torch.
+
+    Autograd starts its threads at the first derivative of the process, and modules of tests compute
+    some while they are imported.
+    """
+    import claimed_tensors
+
+    claimed_tensors.register()
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the checkout."""
@@ -92,10 +103,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "data_folder" in getattr(item, "fixturenames", ()):
             item.add_marker("data")
-    if any(item.get_closest_marker("fake_cuda") for item in items):
-        import claimed_tensors
-
-        claimed_tensors.register()  # before the first derivative, when autograd starts threads
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return
