@@ -452,7 +452,7 @@ def rows(out: Path, count: int, has_walls: bool) -> Iterator[dict[str, Any]]:
         kept = {row["number"]: row for row in lines if row["settings"] == settings}
     for number in range(count):
         if number not in kept:
-            row = Room.draw(number, has_walls).row() | {"settings": settings}
+            row: dict[str, Any] = {**Room.draw(number, has_walls).row(), "settings": settings}
             with file.open("a") as rest:
                 rest.write(json.dumps(row) + "\n")
             kept[number] = row
