@@ -17,13 +17,13 @@ torch registers for backends that are written in Python.
 import inspect
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -313,3 +313,35 @@ def check_on_gpu(case: Case) -> None:
     for one, other in zip(found, expected, strict=True):
         one, other = one.detach().cpu(), other.detach()
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6, equal_nan=True)
+
+
+class DeviceTests:
+    """Tests of a room's functions; a subclass in each room has its cases.
+
+    Attributes:
+        room: module of the room, dotted.
+        cases: a case for each public function or method.
+        no_case: why others have none.
+        on_cpu: names of cases whose results are on the CPU wherever their arguments are.
+    """
+
+    room: ClassVar[str]
+    cases: ClassVar[Mapping[str, Case]]
+    no_case: ClassVar[Mapping[str, str]]
+    on_cpu: ClassVar[Collection[str]]
+
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Give each test of a case the names of all."""
+        if "name" in metafunc.fixturenames:
+            metafunc.parametrize("name", sorted(self.cases))
+
+    def test_is_at_home_on_both_devices(self, name: str) -> None:
+        check_case(self.cases[name], returns_on_cpu=name in self.on_cpu)
+
+    @pytest.mark.gpu
+    def test_is_the_same_on_a_gpu(self, name: str) -> None:
+        check_on_gpu(self.cases[name])
+
+    def test_every_public_function_has_a_case_or_a_reason(self) -> None:
+        assert public_calls(self.room) == self.cases.keys() | self.no_case.keys()
+        assert not self.cases.keys() & self.no_case.keys()

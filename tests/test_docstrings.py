@@ -11,6 +11,7 @@ import pkgutil
 import re
 import textwrap
 from collections.abc import Callable, Iterator
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -92,7 +93,7 @@ def stale_references(module: ModuleType) -> list[str]:
         r"``(?:\w+\.)*([A-Z]\w+\.\w+)(\(\))?``", inspect.getsource(module)
     ):
         owner, member = name.split(".")
-        kinds = CLASSES.get(owner, [])
+        kinds = classes_by_name().get(owner, [])
         if kinds and not any(has_member(kind, member) for kind in kinds):
             found.append(f"{module.__name__}: {name}{text}")
     return found
@@ -117,11 +118,15 @@ MODULES = [
 ]
 
 
-CLASSES: dict[str, list[type]] = {}
-for _module in map(importlib.import_module, MODULES):
-    for _name, _value in vars(_module).items():
-        if isinstance(_value, type) and _value.__module__ == _module.__name__:
-            CLASSES.setdefault(_name, []).append(_value)
+@cache
+def classes_by_name() -> dict[str, list[type]]:
+    """Classes of all modules."""
+    found: dict[str, list[type]] = {}
+    for module in map(importlib.import_module, MODULES):
+        for name, value in vars(module).items():
+            if isinstance(value, type) and value.__module__ == module.__name__:
+                found.setdefault(name, []).append(value)
+    return found
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import invertwin.links as lk
-from claimed_tensors import Case, Move, check_case, check_on_gpu, public_calls
+from claimed_tensors import Case, DeviceTests, Move
 from invertwin.channel import RayPaths, trace_paths
 from invertwin.scene import AntennaArray, TabulatedPattern, linear_array
 from invertwin.scene.polarisation import JonesTable
@@ -115,17 +115,5 @@ NO_CASE = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(CASES))
-def test_is_at_home_on_both_devices(name):
-    check_case(CASES[name], returns_on_cpu=name in ON_CPU)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("name", sorted(CASES))
-def test_is_the_same_on_a_gpu(name):
-    check_on_gpu(CASES[name])
-
-
-def test_every_public_function_has_a_case_or_a_reason():
-    assert public_calls("invertwin.links") == CASES.keys() | NO_CASE.keys()
-    assert not CASES.keys() & NO_CASE.keys()
+class TestDevices(DeviceTests):
+    room, cases, no_case, on_cpu = "invertwin.links", CASES, NO_CASE, ON_CPU

@@ -239,11 +239,8 @@ class PropagationSettings:
         def evaluate_batch(batch: Tensor) -> tuple[Tensor]:
             paths = self.trace_links(scene, sensor, batch, seed)
             ends = {"tx": sensor.mount, "rx": self.receivers}
-            return (
-                responses.frequency_response(paths, frequencies, **ends)[:, 0, :, 0].transpose(
-                    0, 1
-                ),
-            )
+            response = responses.frequency_response(paths, frequencies, **ends)[:, 0, :, 0]
+            return (response.transpose(0, 1),)
 
         return evaluate_in_batches(evaluate_batch, positions)[0]
 

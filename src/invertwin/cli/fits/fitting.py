@@ -167,7 +167,7 @@ def run_fit(
         problem: Problem of the run.
         start: Initial values.
         index: Number of the start.
-        mode: The run's own way to fit, a variant, or one of the data.
+        method: The run's own way to fit, a variant, or one of the data.
         folder: Keeps results and checkpoints.
         console: Shows progress.
         show: Is told of steps as they come.
