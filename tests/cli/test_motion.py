@@ -204,3 +204,20 @@ def test_without_motion_the_scene_is_left_alone():
     scene = build.true_scene(run)
     assert build_moving_scene(run, scene) is scene
     assert isinstance(scene, Scene)
+
+
+def test_breathing_adds_to_another_posture() -> None:
+    """After sitting, and before waving, the chest of a run file's person breathes."""
+    seated = RUN.replace(
+        '{ kind = "walking", speed = 1.4 }',
+        '{ kind = "sitting", duration = 1.0 }, { kind = "breathing", rate = 0.25, depth = 0.01 }',
+    )
+    run = validate_run(tomllib.loads(seated), Path("run.toml"))
+    motion = build_moving_scene(run, build.true_scene(run))
+    assert isinstance(motion, MovingScene)
+    movers, person = motion.motions["person"], motion.scene["person"]
+    assert not callable(movers)
+    sitting, breathing = movers
+    still = sitting(person, 2.0)
+    shift = breathing(still, 2.0).vertices - still.vertices
+    assert float(shift.norm(dim=1).max()) > 0.0099

@@ -38,6 +38,10 @@ from invertwin.radar.processing.doppler_maps import high_resolution_map as high_
 from invertwin.radar.processing.reflectors import detect_points as detect_points
 from invertwin.radar.processing.reflectors import format_points_csv as format_points_csv
 from invertwin.radar.processing.reflectors import noise_power as noise_power
+from invertwin.radar.processing.vital_signs import Oscillation as Oscillation
+from invertwin.radar.processing.vital_signs import VitalSigns as VitalSigns
+from invertwin.radar.processing.vital_signs import estimate_displacement as estimate_displacement
+from invertwin.radar.processing.vital_signs import estimate_vital_signs as estimate_vital_signs
 from invertwin.radar.radar import Radar as Radar
 from invertwin.radar.signal.chirps import Chirps as Chirps
 from invertwin.radar.signal.chirps import moving_beat as moving_beat

@@ -62,6 +62,7 @@ from invertwin.scene.people.motion import MovingScene as MovingScene
 from invertwin.scene.people.motion import ObjectMotion as ObjectMotion
 from invertwin.scene.people.motion import SplineTrajectory as SplineTrajectory
 from invertwin.scene.people.motion import TrajectoryMotion as TrajectoryMotion
+from invertwin.scene.people.vital_signs import Breathing as Breathing
 from invertwin.scene.polarisation import JonesTable as JonesTable
 from invertwin.scene.pose import compose as compose
 from invertwin.scene.pose import from_frame as from_frame

@@ -87,7 +87,9 @@ def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
             if "body" not in row.made_from:
                 found.append(row.build())
                 continue
-            earlier = [mover for mover in found if isinstance(mover, PersonMotion)]
+            # Breathing adds to the posture that the others give.
+            postures = [mover for mover in found if isinstance(mover, PersonMotion)]
+            earlier = [] if row.kind == "breathing" else postures
             if earlier and (row.kind != "waving" or isinstance(earlier[0], Waving)):
                 raise InputError(
                     "expected one motion of a person, or waving after another, got two; remove one"

@@ -160,6 +160,7 @@ def register(registry: Registry) -> None:
     registry.add("motion", "walking", scenes.Walking, checked=False)
     registry.add("motion", "sitting", scenes.Sitting, checked=False)
     registry.add("motion", "waving", scenes.Waving, checked=False)
+    registry.add("motion", "breathing", scenes.Breathing, checked=False)
     registry.add("motion", "turning", scenes.AxisRotation, checked=False)
     registry.add("motion", "along", follow_spline, checked=False)
     for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
