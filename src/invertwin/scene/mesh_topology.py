@@ -84,8 +84,13 @@ def close_cracks(
     whole, onto, open_edges, width = _whole_edges(welded, places, owner), first[:, None], 0, 0.0
     is_open = bool((whole.counts == 1).any())
     edges = _split_at_vertices(whole, places, is_open)
-    square = _by_blocks(lambda rows: ((places[rows] - places[first[rows]]) ** 2).sum(1), len(first))
-    moves, along = square > _MAX_OFFSET**2, places[:, 0] * 0
+
+    def are_apart(rows: slice) -> Bool[np.ndarray, " block"]:
+        gap = places[rows] - places.take(first[rows], 0)
+        return np.vecdot(gap, gap) > _MAX_OFFSET**2
+
+    moves = _by_blocks(are_apart, len(first))
+    along = np.zeros(len(places))
     if (edges.counts == 1).any():
         onto, along, open_edges, width = _find_cracks(edges, places)
         onto, along = onto[first], along[first]
@@ -159,7 +164,12 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     along -= along.min()
     finest = 2 ** min(40, 63 - len(along).bit_length()) - 1
     order = sort_order((along * (finest / max(along.max(), 1.0))).astype(np.int64))
-    start = _find_runs([column.take(order) for column in places.T])
+
+    def differ(rows: slice) -> Bool[np.ndarray, " block"]:
+        columns = places.take(order[rows.start : rows.stop + 1], 0).T
+        return (columns[:, 1:] != columns[:, :-1]).any(0)
+
+    start = np.flatnonzero(np.append(True, _by_blocks(differ, len(order))))
     lowest = order[start]
     pairs = _find_close_pairs(places[lowest], along[lowest])
     if len(pairs):
@@ -179,7 +189,8 @@ def sort_order(numbers: Numbers) -> Numbers:
     """
     bits = len(numbers).bit_length()
     order = numbers << bits
-    order |= np.arange(len(numbers))  # in place: new memory costs as much as the sort
+    for start in range(0, len(order), _BLOCK):  # in place: new memory costs as much as the sort
+        order[start : start + _BLOCK] |= np.arange(start, min(start + _BLOCK, len(order)))
     order.sort()
     order &= (1 << bits) - 1
     return order
@@ -617,5 +628,10 @@ def _point_inwards(
 
 def _volume(faces: Faces, points: Float64[np.ndarray, "v 3"]) -> float:
     """Signed volume of the body that triangles bound [m³]."""
-    near = points - points[faces[0, 0]]  # far from the origin, differences would cancel
-    return float(igl.centroid(near, np.ascontiguousarray(faces))[1])
+    middle = points[faces[0, 0]]  # far from the origin, differences would cancel
+
+    def signed_volumes(rows: slice) -> Float64[np.ndarray, " block"]:
+        a, b, c = np.moveaxis(points.take(faces[rows], 0) - middle, 1, 0)
+        return np.vecdot(a, np.cross(b, c)) / 6
+
+    return float(_by_blocks(signed_volumes, len(faces)).sum())

@@ -52,8 +52,9 @@ class Topology:
         self.vertex_object = owner = vertex_object
         used = torch.bincount(faces.ravel()).nonzero()[:, 0]
         # Vertices of triangles, the first of each object among them, and the object of each.
-        first = torch.searchsorted(owner[used], torch.arange(int(owner.max()) + 1))
-        self.used_vertices = used.numpy(), first.numpy(), owner[used].numpy()
+        own = owner[used]
+        first = torch.searchsorted(own, torch.arange(int(owner[-1]) + 1))
+        self.used_vertices = used.numpy(), first.numpy(), own.numpy()
         welded, edges, places, cracks = mesh_topology.close_cracks(
             vertices.numpy(), faces.numpy(), groups[owner.numpy()], face_object.numpy()
         )
