@@ -11,6 +11,7 @@ Source: derivations §9; Weideman, "Computation of the complex error function", 
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ _NEAR_LIMIT = 16.0  # s² + t² above which the far quadrature is used
 EXP_J_PI_4 = complex(math.sqrt(0.5), math.sqrt(0.5))  # exp(jπ/4)
 _SQRT_PI = math.sqrt(math.pi)
 _DECAY_LIMIT = 6.0  # upper limit of integrals: exp(−36) of the largest value
+_Slopes = Callable[..., tuple[Tensor, ...]]
 _ROWS_AT_ONCE = 1 << 13  # chunks that fit into the processor's cache: ten times as fast
 
 
@@ -63,7 +65,7 @@ def transition(s: Float64[Tensor, "*row"]) -> _Values:
     Args:
         s: signed square root of the phase difference [√rad].
     """
-    return _TransitionFunction.apply(s)  # type: ignore[return-value]
+    return _WithSlopes.apply(_infinite_transition, _infinite_slopes, s)  # type: ignore[return-value]
 
 
 def end_transition(s: _Parameters, t: _Parameters) -> _Values:
@@ -78,7 +80,7 @@ def end_transition(s: _Parameters, t: _Parameters) -> _Values:
         s: as in ``transition``.
         t: lower limit τ = t of the integral; its upper limit is ∞.
     """
-    beyond = _TruncatedTransition.apply(s, t.abs())
+    beyond = _WithSlopes.apply(_truncated_transition, _truncated_slopes, s, t.abs())
     return torch.where(t < 0, transition(s) - beyond, beyond)  # type: ignore[operator]
 
 
@@ -162,10 +164,9 @@ def chain_transition(
     limit = _DECAY_LIMIT / remainder.detach().sqrt()
     x, step = limit[:, None] * node, limit[:, None] * weight
     sides = []
+    shifted = partial(_WithSlopes.apply, _shifted_transition, _shifted_slopes)
     for values, w in zip(outer, coupling, strict=True):
-        up, down = (
-            _ShiftedTransition.apply(values[..., None], sign * w[:, None], x) for sign in (1, -1)
-        )
+        up, down = (shifted(values[..., None], sign * w[:, None], x) for sign in (1, -1))
         sides.append(torch.stack([up + down, up - down]) / 2)
     decay = remainder[:, None] * x**2 + math.sqrt(2) * middle[..., None] * x
     phase = -math.sqrt(2) * middle[..., None] * x
@@ -191,37 +192,39 @@ def _scaled_erfc(x: Tensor) -> Tensor:
 
 
 class _WithSlopes(torch.autograd.Function):
-    """Function of real arguments with written first derivatives; saves arguments and value."""
+    """Complex function of real tensors with written first derivatives, in both modes.
+
+    It takes the function, a function of its arguments and value that returns the derivatives with
+    respect to the first arguments, and the arguments. The others have no derivatives.
+    """
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:  # type: ignore[override]
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
+    def forward(evaluate: Callable[..., Tensor], _: _Slopes, *given: Tensor) -> Tensor:  # type: ignore[override]
+        return evaluate(*given)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # type: ignore[override]
+        _, ctx.slopes, *given = inputs
+        ctx.save_for_backward(*given, output)
+        ctx.save_for_forward(*given, output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        *given, found = ctx.saved_tensors
+        pairs = list(zip(ctx.slopes(*given, found), given, strict=False))
+        gradients = [(grad.conj() * slope).real.sum_to_size(x.shape) for slope, x in pairs]
+        return None, None, *gradients, *[None] * (len(given) - len(pairs))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, __: None, *tangents: Tensor | None) -> Tensor:  # type: ignore[override]
+        pairs = zip(ctx.slopes(*ctx.saved_tensors), tangents, strict=False)
+        return torch.stack([slope * rate for slope, rate in pairs if rate is not None]).sum(0)
 
 
-def _push_forward(slopes: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Tensor:
-    """Sum of slopes times tangents, of which some may be None."""
-    pairs = zip(slopes, tangents, strict=True)
-    return torch.stack([slope * tangent for slope, tangent in pairs if tangent is not None]).sum(0)
-
-
-class _ShiftedTransition(_WithSlopes):
+def _shifted_transition(s: Tensor, w: Tensor, x: Tensor) -> Tensor:
     """exp(−w²x²) g(s − exp(−jπ/4) w x), with g continued analytically from s ≥ 0."""
-
-    @staticmethod
-    def forward(s: Tensor, w: Tensor, x: Tensor) -> Tensor:  # type: ignore[override]
-        s, shift = torch.broadcast_tensors(s, w * x)
-        return _apply_in_chunks(_evaluate_shifted, s, shift)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
-        s, w, x, found = ctx.saved_tensors
-        by_s, by_w = ((grad.conj() * slope).real for slope in _shifted_derivatives(s, w, x, found))
-        return by_s.sum_to_size(s.shape), by_w.sum_to_size(w.shape), None
-
-    @staticmethod
-    def jvp(ctx: Any, tangent_s: Any, tangent_w: Any, _: Any) -> Tensor:  # type: ignore[override]
-        return _push_forward(_shifted_derivatives(*ctx.saved_tensors), (tangent_s, tangent_w))
+    s, shift = torch.broadcast_tensors(s, w * x)
+    return _apply_in_chunks(_evaluate_shifted, s, shift)
 
 
 def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
@@ -234,7 +237,7 @@ def _evaluate_shifted(s: Tensor, shift: Tensor) -> Tensor:
     return _SQRT_PI * EXP_J_PI_4 * torch.where(beyond, 2 * direct - size, size)
 
 
-def _shifted_derivatives(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+def _shifted_slopes(s: Tensor, w: Tensor, x: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     by_s = 2j * (s - EXP_J_PI_4.conjugate() * w * x) * value - 2j * torch.exp(-((w * x) ** 2))
     return by_s, -EXP_J_PI_4.conjugate() * x * by_s - 2 * w * x * x * value
 
@@ -244,46 +247,23 @@ def _half_erfc(x: Tensor) -> Tensor:
     return 0.5 * phasor(-x * x) * _scaled_erfc(x)
 
 
-class _TransitionFunction(_WithSlopes):
-    """Transition function g(s) with first derivatives."""
-
-    @staticmethod
-    def forward(s: Tensor) -> Tensor:  # type: ignore[override]
-        size = _SQRT_PI * EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
-        return torch.where(s < 0, -size, size)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
-        s, g = ctx.saved_tensors
-        return (grad.conj() * (2j * s * g - 2j)).real
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:  # type: ignore[override]
-        s, g = ctx.saved_tensors
-        return tangent * (2j * s * g - 2j)
+def _infinite_transition(s: Tensor) -> Tensor:
+    size = _SQRT_PI * EXP_J_PI_4 * _apply_in_chunks(_scaled_erfc, s.abs())
+    return torch.where(s < 0, -size, size)
 
 
-class _TruncatedTransition(_WithSlopes):
+def _infinite_slopes(s: Tensor, value: Tensor) -> tuple[Tensor]:
+    return (2j * s * value - 2j,)
+
+
+def _truncated_transition(s: Tensor, t: Tensor) -> Tensor:
     """Part of g(s) beyond t ≥ 0, odd in s."""
-
-    @staticmethod
-    def forward(s: Tensor, t: Tensor) -> Tensor:  # type: ignore[override]
-        s, t = torch.broadcast_tensors(s, t)
-        found = _apply_in_chunks(_evaluate_truncated, s.abs(), t)
-        return torch.where(s < 0, -found, found)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        s, t, found = ctx.saved_tensors
-        by_s, by_t = ((grad.conj() * slope).real for slope in _truncated_derivatives(s, t, found))
-        return by_s.sum_to_size(s.shape), by_t.sum_to_size(t.shape)
-
-    @staticmethod
-    def jvp(ctx: Any, tangent_s: Tensor | None, tangent_t: Tensor | None) -> Tensor:  # type: ignore[override]
-        return _push_forward(_truncated_derivatives(*ctx.saved_tensors), (tangent_s, tangent_t))
+    s, t = torch.broadcast_tensors(s, t)
+    found = _apply_in_chunks(_evaluate_truncated, s.abs(), t)
+    return torch.where(s < 0, -found, found)
 
 
-def _truncated_derivatives(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+def _truncated_slopes(s: Tensor, t: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives with respect to s and t of the part beyond t; finite at s = t = 0."""
     square = (s * s + t * t).clamp_min(1e-300)
     half = _apply_in_chunks(_half_erfc, t)
