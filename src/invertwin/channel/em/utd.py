@@ -25,15 +25,8 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from invertwin.channel.em import transition_functions as transitions
 from invertwin.channel.em.plane_waves import cross, dot, plane_of_incidence, reflect_vectors
-from invertwin.channel.em.transition_functions import (
-    EXP_J_PI_4,
-    chain_transition,
-    corner_transition,
-    edge_transition,
-    edge_transition_slope,
-    transition,
-)
 from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.scene.material.fresnel import FieldCoefficients
 
@@ -148,7 +141,7 @@ def double_dyad(
     before, after = _couple_cotangents(first, wave_number), _couple_cotangents(second, wave_number)
     # All pairs: [term of the first edge, term of the second, row].
     w = before.sides[1][:, None, None] * after.sides[0][:, None] * coupling
-    same, opposite = corner_transition(before.s[:, None], after.s, torch.stack([w, -w]))
+    same, opposite = transitions.corner_transition(before.s[:, None], after.s, torch.stack([w, -w]))
     strength = before.value[:, None] * (same + opposite) * after.value
     strength = (strength + before.slope[:, None] * (same - opposite) * after.slope) / 2
     return torch.einsum("abr,brij,arjk->rik", strength, _term_dyads(second), _term_dyads(first))
@@ -186,7 +179,8 @@ def triple_dyad(
         others = [edge for edge in range(3) if edge != center]
         middle, *outer = (cotangents[edge].rows(rows) for edge in (center, *others))
         coupled = [couplings[rows, center, other] for other in others]
-        parts = chain_transition(middle.s.abs(), [edge.s.abs() for edge in outer], coupled)
+        sizes = [edge.s.abs() for edge in outer]
+        parts = transitions.chain_transition(middle.s.abs(), sizes, coupled)
         strength = torch.zeros(parts.shape[2:], dtype=torch.complex128)
         for odd in itertools.product((0, 1), (0, 1)):
             weights = [middle.strength(sum(odd))]
@@ -230,7 +224,7 @@ class _CoupledCotangents(NamedTuple):
 
 
 def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _CoupledCotangents:
-    opening = diffraction.wedges.opening
+    opening, ends = diffraction.wedges.opening, diffraction.end_parameters
     root = torch.sqrt(2 * wave_number * diffraction.distance_parameter)
     scale = -_dyad_scale(diffraction, wave_number) * root
     columns = []
@@ -241,7 +235,7 @@ def _couple_cotangents(diffraction: EdgeDiffraction, wave_number: float) -> _Cou
         ratio = torch.where(is_near, opening, torch.sin(safe) / torch.sin(safe / opening))
         cosine = torch.cos(half / opening)
         s = root * torch.sin(half)
-        factor = scale * (edge_transition(s, diffraction.end_parameters) / transition(s))
+        factor = scale * transitions.edge_transition(s, ends) / transitions.transition(s)
         curve = factor * ratio**3 * cosine / opening**2
         quotient = factor * _cotangent_quotient(half, opening)
         columns.append((quotient, factor * ratio**2 / opening, curve, s))
@@ -285,7 +279,7 @@ def _term_signs(diffraction: EdgeDiffraction) -> tuple[tuple[float, float], ...]
 
 
 def _dyad_scale(diffraction: EdgeDiffraction, wave_number: float) -> Tensor:
-    return -EXP_J_PI_4.conjugate() / (
+    return -transitions.EXP_J_PI_4.conjugate() / (
         2 * diffraction.wedges.opening * math.sqrt(2 * math.pi * wave_number) * diffraction.sin_beta
     )
 
@@ -331,7 +325,7 @@ def _cotangent(
     half = _half_boundary_angle(diffraction, azimuth_sign, sign)
     quotient = _cotangent_quotient(half, opening)
     s = root * torch.sin(half)
-    transition_value = edge_transition(s, diffraction.end_parameters)
+    transition_value = transitions.edge_transition(s, diffraction.end_parameters)
     value = -quotient * root * transition_value
     if not with_slope:
         return value, value
@@ -341,7 +335,7 @@ def _cotangent(
     curvature = opening * (1 / 6 + 1 / (3 * opening**2))
     slope = torch.cos(safe) / tangent - sine / (opening * torch.sin(safe / opening) ** 2)
     slope = torch.where(near, -2 * curvature * half, slope)
-    by_s = edge_transition_slope(s, diffraction.end_parameters, transition_value)
+    by_s = transitions.edge_transition_slope(s, diffraction.end_parameters, transition_value)
     by_half = -root * (slope * transition_value + quotient * by_s * root * torch.cos(half))
     return value, by_half * (-sign / 2)
 
@@ -359,17 +353,29 @@ def _geometric_optics_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Ten
     """
     axis, direction = edge_axis(diffraction.wedges), diffraction.incident_direction
     basis = _ray_fixed_basis(axis, diffraction.diffracted_direction)
-    shadowed = torch.eye(3, dtype=torch.complex128) - _transmission_dyad(diffraction)
+    faces = [_face_dyads(diffraction, face) for face in (0, 1)]
+    # Zero behind bodies; one sheet at an open edge, two at a crease.
+    flat = (diffraction.wedges.opening > 2 - _SHEET_TOLERANCE)[:, None, None]
+    through = torch.where(flat, faces[0][1], faces[1][1] @ faces[0][1])
+    shadowed = torch.eye(3, dtype=torch.complex128) - through
     dyads = [_rotate_dyad(basis, _ray_fixed_basis(axis, direction), shadowed)]
     for face in (1, 0):
-        normal = diffraction.wedges.normals[:, face]
-        unit_s, unit_p, reflected_p = (v[:, 0] for v in plane_of_incidence(normal, direction))
-        law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        reflection = outer_product(law.reflection_s, unit_s, unit_s)
-        reflection = reflection + outer_product(law.reflection_p, reflected_p, unit_p)
-        reflected = reflect_vectors(direction, normal)
-        dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), reflection))
+        reflected = reflect_vectors(direction, diffraction.wedges.normals[:, face])
+        dyads.append(_rotate_dyad(basis, _ray_fixed_basis(axis, reflected), faces[face][0]))
     return dyads
+
+
+def _face_dyads(
+    diffraction: EdgeDiffraction, face: int
+) -> tuple[Complex128[Tensor, "row 3 3"], Complex128[Tensor, "row 3 3"]]:
+    """Dyads of the reflection at a face and of the transmission through it."""
+    normal, direction = diffraction.wedges.normals[:, face], diffraction.incident_direction
+    s, before, after = (v[:, 0] for v in plane_of_incidence(normal, direction))
+    law = diffraction.face_coefficients(face, dot(normal, direction).abs())
+    reflection = outer_product(law.reflection_s, s, s)
+    through = outer_product(law.transmission_s, s, s)
+    reflection = reflection + outer_product(law.reflection_p, after, before)
+    return reflection, through + outer_product(law.transmission_p, before, before)
 
 
 def outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[Tensor, "row 3 3"]:
@@ -385,18 +391,3 @@ def outer_product(strength: Tensor, left: Tensor, right: Tensor) -> Complex128[T
 def _rotate_dyad(leaving: Tensor, arriving: Tensor, law: Tensor) -> Complex128[Tensor, "row 3 3"]:
     """Rotate the fields of a dyad about the edge, from the arriving to the leaving basis."""
     return (leaving.mT @ arriving).to(torch.complex128) @ law
-
-
-def _transmission_dyad(diffraction: EdgeDiffraction) -> Complex128[Tensor, "row 3 3"]:
-    """Transmission dyad: zero behind bodies; one sheet at an open edge, two at a crease."""
-    flat = (diffraction.wedges.opening > 2 - _SHEET_TOLERANCE)[:, None, None]
-    direction = diffraction.incident_direction
-    total = torch.eye(3, dtype=torch.complex128)
-    for face in (0, 1):
-        normal = diffraction.wedges.normals[:, face]
-        unit_s, unit_p, _ = (v[:, 0] for v in plane_of_incidence(normal, direction))
-        law = diffraction.face_coefficients(face, dot(normal, direction).abs())
-        through = outer_product(law.transmission_s, unit_s, unit_s)
-        through = through + outer_product(law.transmission_p, unit_p, unit_p)
-        total = through if face == 0 else torch.where(flat, total, through @ total)
-    return total
