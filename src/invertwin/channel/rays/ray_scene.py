@@ -123,17 +123,20 @@ class Occluders:
         return RayIntersection(valid, point, hit.t)
 
     def find_first_hits(
-        self, origin: Tensor, direction: Tensor
+        self, origin: Tensor, direction: Tensor, reach: Tensor | None = None
     ) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
         """Find the first triangle on rays (−1: none), and its distance (infinite without a hit).
 
         Args:
             origin: origins about the local origin, [n, 3] [m].
             direction: directions [n, 3], in whose lengths distances count.
+            reach: largest distances; None = all.
         """
-        ray = mi.Ray3f(
-            arrays.to_vectors(mi.Point3f, origin), arrays.to_vectors(mi.Vector3f, direction)
-        )
+        if not len(origin):
+            return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
+        start = arrays.to_vectors(mi.Point3f, origin)
+        most = dr.largest(mi.Float) if reach is None else arrays.to_float(reach)
+        ray = mi.Ray3f(start, arrays.to_vectors(mi.Vector3f, direction), most, 0.0, [])
         hit = self.scene.ray_intersect_preliminary(ray)
         face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)

@@ -80,8 +80,6 @@ class ViewpointScene:
         Args:
             directions: Directions in the world, of any length.
         """
-        if not len(directions):
-            return torch.zeros(0, dtype=torch.int64)
         way = normalize(strip_derivatives(directions), dim=1).to(torch.float32)
         with tracing():
             return self._occluders.find_first_hits(torch.zeros_like(way), way)[0]

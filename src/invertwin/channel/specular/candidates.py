@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.rays.arrays import to_float, to_index, to_torch, to_vectors
-from invertwin.channel.rays.backend import dr, mi
+from invertwin.channel.em.plane_waves import reflect_vectors
 from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces, Planes
 from invertwin.runtime.memory import require_at_most
 
@@ -91,27 +90,6 @@ def find_sequences(
 ) -> CandidateSequences:
     """Find candidate sequences of up to ``depth`` steps by shooting rays, or enumerate all.
 
-    Args:
-        surfaces, interactions, origins, depth, seed: as of ``shoot_sequences``.
-        rays: number of rays from each origin; None enumerates all sequences.
-    """
-    if not depth or rays == 0:
-        return CandidateSequences((), None)
-    if rays is None:
-        return enumerate_sequences(surfaces.planes, interactions, depth)
-    return shoot_sequences(surfaces, interactions, origins, depth, rays, seed)
-
-
-def shoot_sequences(
-    surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
-    origins: Float64[Tensor, "place 3"],
-    depth: int,
-    rays: int,
-    seed: int,
-) -> CandidateSequences:
-    """Find the sequences that rays from given origins follow (shooting rays).
-
     Directions form a golden spiral, rotated at random for every origin. At a surface that reflects
     and transmits, a ray splits. A sequence that subtends the solid angle Ω at the antenna is missed
     by all of N independent random directions with the probability (1 − Ω/4π)^N < exp(−NΩ/4π);
@@ -125,12 +103,15 @@ def shoot_sequences(
         interactions: interactions of the triangles.
         origins: origins of the rays [m].
         depth: maximum number of steps.
-        rays: number of rays from each origin.
+        rays: number of rays from each origin; None enumerates all sequences.
         seed: random seed of the rotations.
 
     Source: I. J. Good, "The population frequencies of species", Biometrika 40, 1953.
     """
-    tables = _SequenceTracer(surfaces, interactions)
+    if not depth or rays == 0:
+        return CandidateSequences((), None)
+    if rays is None:
+        return enumerate_sequences(surfaces.planes, interactions, depth)
     # A ray may split at every step.
     chunk = max(1, _LANES // 2 ** (depth if bool(interactions.transmit.any()) else 0))
     leaves = torch.zeros(0, depth, dtype=torch.int64)
@@ -141,8 +122,8 @@ def shoot_sequences(
         for start in range(0, rays, chunk):
             index = torch.arange(start, min(start + chunk, rays))
             directions = _spiral_directions(index, rays) @ rotation.T
-            prefix_index = torch.zeros(len(index), dtype=torch.int64)
-            row, row_count = tables.follow_rays(origin, directions, depth, DIRECT, prefix_index)
+            started = (origin, directions), depth, DIRECT, torch.zeros_like(index)
+            row, row_count = _follow_rays(surfaces, interactions, *started)
             leaves, group = torch.cat([leaves, row]).unique(dim=0, return_inverse=True)
             both = torch.cat([count, row_count])
             count = torch.zeros(len(leaves), dtype=torch.int64).index_add(0, group, both)
@@ -168,14 +149,14 @@ def shoot_sequences_from_edges(
         depth: maximum number of steps.
         seed: random seed of the directions.
     """
-    tables = _SequenceTracer(surfaces, interactions)
     branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     draws = np.random.default_rng(seed).standard_normal((len(origins), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
     prefix = torch.arange(int(edge.max()) + 1)[:, None]
     leaves = torch.zeros(0, depth + 1, dtype=torch.int64)
     for some in torch.arange(len(origins)).split(max(1, _LANES // branches)):
-        rows, _ = tables.follow_rays(origins[some], directions[some], depth, prefix, edge[some])
+        started = (origins[some], directions[some]), depth, prefix, edge[some]
+        rows, _ = _follow_rays(surfaces, interactions, *started)
         leaves = torch.cat([leaves, rows]).unique(dim=0)
     return _split_by_length(leaves, 2)
 
@@ -195,72 +176,54 @@ def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
     return torch.stack([ring * around.cos(), ring * around.sin(), z], 1)
 
 
-class _SequenceTracer:
-    """Traces rays through a scene and records the sequences of planes that they meet."""
+def _follow_rays(
+    surfaces: CandidateSurfaces,
+    interactions: FaceInteractions,
+    rays: tuple[Tensor, Tensor],
+    depth: int,
+    prefixes: Tensor,
+    parent: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Sequences of planes that rays meet, padded with −1, and the number of rays that follow each.
 
-    def __init__(self, surfaces: CandidateSurfaces, interactions: FaceInteractions) -> None:
-        self.surfaces, self.planes, self.interactions = surfaces, surfaces.planes, interactions
-        self.normal = to_float(self.planes.normal)
-        self.face_plane = to_index(self.planes.face_plane.clamp_min(0))
-
-    def follow_rays(
-        self, position: Tensor, directions: Tensor, depth: int, prefixes: Tensor, parent: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Sequences of rays, padded with −1, and the number of rays that follow each.
-
-        Rays start from one position, or each from its own. They extend the rows ``parent`` of
-        ``prefixes``.
-        """
-        origin = (position - self.surfaces.origin).to(torch.float32).expand(len(directions), 3)
-        direction = directions.to(torch.float32)
-        # Sequences are a tree: each is the number of its parent and one more step.
-        ended: list[tuple[Tensor, Tensor]] = []
-        width = prefixes.shape[1] + depth
-        for step in range(depth):
-            if step:
-                origin = origin + self.surfaces.margin * direction
-            face, point, reflected = self._intersect_rays(origin, direction)
-            hit = (face >= 0) & (self.planes.face_plane[face.clamp_min(0)] >= 0)
-            ended.append((prefixes, parent[~hit]))
-            columns = parent, face, point, reflected, direction
-            parent, face, point, reflected, direction = (column[hit] for column in columns)
-            branches = []
-            for mask, next_direction, bit in (
-                (self.interactions.reflect, reflected, 0),
-                (self.interactions.transmit, direction, 1),
-            ):
-                chosen = mask[face]
-                code = 2 * self.planes.face_plane[face[chosen]] + bit
-                branches.append((parent[chosen], code, point[chosen], next_direction[chosen]))
-            stops = ~(self.interactions.reflect[face] | self.interactions.transmit[face])
-            ended.append((prefixes, parent[stops]))
-            columns = zip(*branches, strict=True)
-            parent, code, origin, direction = (torch.cat(column) for column in columns)
-            options = 2 * len(self.planes)
-            pair, parent = (parent * options + code).unique(return_inverse=True)
-            prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)
-            if step == depth - 1:
-                ended.append((prefixes, parent))
-        rows, counts = [], []
-        for table, parent in ended:
-            some, count = parent.unique(return_counts=True)
-            rows.append(torch.nn.functional.pad(table[some], (0, width - table.shape[1]), value=-1))
-            counts.append(count)
-        return torch.cat(rows), torch.cat(counts)
-
-    def _intersect_rays(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Triangle that each ray hits (−1: none), the hit point, and the reflected direction."""
-        if not len(origin):
-            none = torch.zeros(0, 3)
-            return torch.zeros(0, dtype=torch.int64), none, none
-        start, ray_direction = to_vectors(mi.Point3f, origin), to_vectors(mi.Vector3f, direction)
-        hit = self.surfaces.scene.ray_intersect_preliminary(mi.Ray3f(start, ray_direction))
-        valid = hit.is_valid()
-        face = dr.select(valid, mi.Int32(hit.prim_index), -1)
-        plane = dr.gather(mi.UInt32, self.face_plane, hit.prim_index, valid)
-        normal = dr.gather(mi.Vector3f, self.normal, plane, valid)
-        point = start + ray_direction * dr.select(valid, hit.t, 0.0)
-        reflected = ray_direction - 2 * dr.dot(ray_direction, normal) * normal
-        dr.eval(face, point, reflected)
-        ends = [torch.stack([to_torch(x) for x in vector], 1) for vector in (point, reflected)]
-        return to_torch(face).long(), ends[0], ends[1]
+    Rays start from one position, or each from its own. They extend the rows ``parent`` of
+    ``prefixes``.
+    """
+    position, directions = rays
+    origin = (position - surfaces.origin).to(torch.float32).expand(len(directions), 3)
+    direction = directions.to(torch.float32)
+    face_plane, normals = surfaces.planes.face_plane, surfaces.planes.normal.to(torch.float32)
+    # Sequences are a tree: each is the number of its parent and one more step.
+    ended: list[tuple[Tensor, Tensor]] = []
+    width = prefixes.shape[1] + depth
+    for step in range(depth):
+        if step:
+            origin = origin + surfaces.margin * direction
+        face, distance = surfaces.find_first_hits(origin, direction)
+        hit = (face >= 0) & (face_plane[face.clamp_min(0)] >= 0)
+        ended.append((prefixes, parent[~hit]))
+        point = origin + distance.to(torch.float32)[:, None] * direction
+        parent, face, point, direction = (x[hit] for x in (parent, face, point, direction))
+        branches = []
+        for mask, next_direction, bit in (
+            (interactions.reflect, reflect_vectors(direction, normals[face_plane[face]]), 0),
+            (interactions.transmit, direction, 1),
+        ):
+            chosen = mask[face]
+            code = 2 * face_plane[face[chosen]] + bit
+            branches.append((parent[chosen], code, point[chosen], next_direction[chosen]))
+        stops = ~(interactions.reflect[face] | interactions.transmit[face])
+        ended.append((prefixes, parent[stops]))
+        columns = zip(*branches, strict=True)
+        parent, code, origin, direction = (torch.cat(column) for column in columns)
+        options = 2 * len(surfaces.planes)
+        pair, parent = (parent * options + code).unique(return_inverse=True)
+        prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)
+        if step == depth - 1:
+            ended.append((prefixes, parent))
+    rows, counts = [], []
+    for table, parent in ended:
+        some, count = parent.unique(return_counts=True)
+        rows.append(torch.nn.functional.pad(table[some], (0, width - table.shape[1]), value=-1))
+        counts.append(count)
+    return torch.cat(rows), torch.cat(counts)
