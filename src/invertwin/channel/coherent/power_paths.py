@@ -11,13 +11,8 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.coherent.radar_equation import (
-    MaterialPoints,
-    PathTransfer,
-    SurfacePaths,
-    evaluate_paths,
-    radar_equation,
-)
+from invertwin.channel.coherent import radar_equation
+from invertwin.channel.coherent.radar_equation import PathTransfer, SurfacePaths, evaluate_paths
 from invertwin.channel.em.depolarisation import received_power_fraction
 from invertwin.channel.em.plane_waves import barycentric_coordinates, dot
 from invertwin.channel.paths import Link, Paths, concatenate_paths
@@ -50,7 +45,7 @@ class ProjectedSilhouettes:
     face: Int64[Tensor, " n"]
     b1: Float64[Tensor, " n"]
     b2: Float64[Tensor, " n"]
-    point: MaterialPoints
+    point: radar_equation.MaterialPoints
     area_rate: Float64[Tensor, " n"]
 
 
@@ -94,8 +89,9 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
     if not link.shared_visibility:
         weight = weight * is_visible(rays, shadow, other)
     speed = dot(tangent, moving - material) * weight
-    place = MaterialPoints(shadow, normal, torch.ones_like(b1), geometry.face_surface[face])
-    return ProjectedSilhouettes(frame, face, b1, b2, place, speed)
+    place = shadow, normal, torch.ones_like(b1), geometry.face_surface[face]
+    point = radar_equation.MaterialPoints(*place)
+    return ProjectedSilhouettes(frame, face, b1, b2, point, speed)
 
 
 def trace_shadow_boundary_paths(
@@ -121,7 +117,7 @@ def trace_shadow_boundary_paths(
         return []
     edge = project_silhouettes(rays, sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress())
     with torch.no_grad():
-        echo = radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
+        echo = radar_equation.radar_equation(rays.geometry, rays.link, edge.frame, [edge.point])
     return [make_paths(edge, echo)]
 
 

@@ -13,11 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from invertwin.channel.coherent.radar_equation import (
-    SurfacePaths,
-    radar_equation,
-    trace_transmittance,
-)
+from invertwin.channel.coherent import radar_equation
+from invertwin.channel.coherent.radar_equation import SurfacePaths, trace_transmittance
 from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
@@ -203,7 +200,8 @@ class _RoughPathSampler:
         last, total = places[-1], torch.zeros_like(paths.weight)
         for number in self.frames.tolist():
             frame = torch.full((len(total),), number)
-            echo, ends = radar_equation(self.geometry, link, frame, places), [(link.tx, places[0])]
+            echo = radar_equation.radar_equation(self.geometry, link, frame, places)
+            ends = [(link.tx, places[0])]
             if received:
                 power = echo.power
                 ends.append((link.rx, last))

@@ -21,13 +21,9 @@ from invertwin.channel.em.plane_waves import dot, interpolate_vectors, triangle_
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.intersections import find_overlapping_pairs, intersect_triangles
 from invertwin.channel.rays.topology import Topology, topology_of
-from invertwin.channel.specular import trace_paths
+from invertwin.channel.specular import image_method, trace_paths
 from invertwin.channel.specular.candidates import find_sequences
-from invertwin.channel.specular.image_method import (
-    CandidateSurfaces,
-    SpecularPaths,
-    find_paths_along,
-)
+from invertwin.channel.specular.image_method import CandidateSurfaces, find_paths_along
 from invertwin.channel.specular.ray_paths import RayPaths, join_ray_paths
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.scene.mesh import Mesh
@@ -81,7 +77,7 @@ class CoverageTrace:
 
 
 #: Paths to a batch of points: the points' numbers, and the paths.
-_PointBatch = tuple[Tensor, list[SpecularPaths]]
+_PointBatch = tuple[Tensor, list[image_method.SpecularPaths]]
 
 
 def trace_coverage(
@@ -171,7 +167,8 @@ class _CoverageTracer:
             local = replace(stage, rx=rx, rx_velocity=torch.zeros_like(rx))
 
             def total(
-                local: trace_paths.PathScene = local, parts: list[SpecularPaths] = parts
+                local: trace_paths.PathScene = local,
+                parts: list[image_method.SpecularPaths] = parts,
             ) -> Tensor:
                 count = len(self.tx) * len(local.rx)
                 sums = torch.zeros(count, self.measure.count, dtype=torch.float64)

@@ -21,13 +21,8 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-from invertwin.channel.em.plane_waves import (
-    cross,
-    dot,
-    interpolate_vectors,
-    reflect_vectors,
-    triangle_normals,
-)
+from invertwin.channel.em import plane_waves as waves
+from invertwin.channel.em.plane_waves import cross, dot, interpolate_vectors, reflect_vectors
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
@@ -393,14 +388,14 @@ def evaluate_illumination_boundary(
     """
     legs, edges = samples.rays, samples.edges.select(samples.rays.edge_point)
     corners = vertices[surfaces.topology.faces[legs.faces]]
-    normal, point = triangle_normals(corners), corners[..., 0, :]
+    normal, point = waves.triangle_normals(corners), corners[..., 0, :]
     image = image_positions(tx[legs.source], point, normal, legs.through)[-1]
     # Only surfaces after the edge reflect the edge point.
     direct = legs.through | (torch.arange(legs.faces.shape[1]) < legs.steps_before_edge[:, None])
     y0, y1 = vertices[edges.ends].unbind(1)
     y = image_positions(torch.lerp(y0, y1, edges.fraction[:, None]), point, normal, direct)[-1]
     facets = receiving_corners[samples.face]
-    p0, up = facets[:, 0], triangle_normals(facets)
+    p0, up = facets[:, 0], waves.triangle_normals(facets)
     ray = y - image
     scale = dot(p0 - image, up) / dot(ray, up)
     curve = image + scale[:, None] * ray

@@ -35,15 +35,10 @@ from invertwin.channel.rays.ray_scene import RayScene, face_areas
 from invertwin.channel.rays.scene_tables import Geometry, flatten
 from invertwin.channel.rows import Rows
 from invertwin.channel.sampling import Sampling
-from invertwin.channel.specular import image_method
+from invertwin.channel.specular import image_method, trace_paths
 from invertwin.channel.specular.candidates import enumerate_sequences, shoot_sequences_from_edges
 from invertwin.channel.specular.ray_paths import REFLECTION, RayPaths, join_ray_paths, match_rows
-from invertwin.channel.specular.trace_paths import (
-    PathScene,
-    evaluate_paths,
-    face_interactions,
-    prepare_path_scene,
-)
+from invertwin.channel.specular.trace_paths import PathScene, evaluate_paths, face_interactions
 from invertwin.checks import ArrayLike, is_differentiated, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -135,7 +130,7 @@ def trace_single_scattering(
         InputError: derivatives with respect to motion where a surface touches or intersects one
             that scatters.
     """
-    stage = replace(prepare_path_scene(scene, tx, rx, frequency), velocities=None)
+    stage = replace(trace_paths.prepare_path_scene(scene, tx, rx, frequency), velocities=None)
     counts = len(stage.tx), len(stage.rx)
 
     def sum_links(pairs: ScatteredPairs) -> Tensor:

@@ -13,18 +13,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from invertwin.channel.power import integrand, intersection_curves
+from invertwin.channel.power import integrand, intersection_curves, silhouettes
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
 from invertwin.channel.power.random_walk import PathState, RandomWalk
-from invertwin.channel.power.silhouettes import (
-    SampleBatch,
-    SilhouetteSample,
-    SilhouetteSampler,
-    shadow_speed,
-)
+from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler, shadow_speed
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
@@ -45,7 +40,7 @@ class _Sampler(Protocol):
 
     size: int
 
-    def draw(self, index: mit.UInt32) -> SampleBatch[Any]: ...
+    def draw(self, index: mit.UInt32) -> silhouettes.SampleBatch[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -159,7 +154,7 @@ class BoundarySamples:
         # Each sampler is bound here: a generator expression would draw all of them from the last.
         later = [
             map(
-                SampleBatch.compress,
+                silhouettes.SampleBatch.compress,
                 map(s.draw, itertools.islice(self._chunks(s.size), len(now), None)),
             )
             for s, now in zip(self._samplers, first, strict=True)

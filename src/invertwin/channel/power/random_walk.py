@@ -13,14 +13,11 @@ from functools import cached_property
 from typing import Any, TypedDict, cast
 
 from invertwin.channel.power import integrand
+from invertwin.channel.power import transmission as sheets
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.direction_sampling import DirectionSampler
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
-from invertwin.channel.power.transmission import (
-    SegmentTransmission,
-    trace_to_surface,
-    trace_transmission,
-)
+from invertwin.channel.power.transmission import SegmentTransmission, trace_transmission
 from invertwin.channel.rays.arrays import opaque, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
@@ -266,7 +263,7 @@ class RandomWalk:
         origin = point.position + side * (RAY_EPSILON * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
         key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM_STEP
-        hit = trace_to_surface(self.rays, self.inputs, ray, active, key, coherent=False)
+        hit = sheets.trace_to_surface(self.rays, self.inputs, ray, active, key, coherent=False)
         active &= hit.valid & self.rays.is_in_scene(state["frame"], hit.point.face, active)
         found = integrand.compute_interaction(self.inputs, hit.point, active)
         to_point, distance = integrand.direction_and_distance(found.position, point.position)

@@ -13,15 +13,11 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import Generic, TypeVar, cast
 
 from invertwin.channel.power import integrand
+from invertwin.channel.power import transmission as sheets
 from invertwin.channel.power.discrete import DiscreteSampler, balance_by_object, sample_edge_point
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.mesh_folds import is_hidden_by_fold
-from invertwin.channel.power.transmission import (
-    SegmentHit,
-    SegmentTransmission,
-    trace_to_surface,
-    trace_transmission,
-)
+from invertwin.channel.power.transmission import SegmentHit, SegmentTransmission
 from invertwin.channel.rays import surface_point
 from invertwin.channel.rays.arrays import gather_points, scramble_seed
 from invertwin.channel.rays.backend import dr, mi, mit
@@ -211,7 +207,7 @@ class SilhouetteSampler:
         aside = EDGE_OFFSET * (dr.norm(y) + dr.norm(y1 - y0))
         beside, away = mi.Point3f(y + sides.outward * aside), mi.Vector3f(exact)
         reach = beside - away * _START_OFFSET if self.resting is not None else beside
-        before = trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
+        before = sheets.trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.has_contrast
         ray = beside, away, valid, (index, self.transmission_seed)
         hit = trace_past_edge(
@@ -351,7 +347,7 @@ def trace_past_edge(
         rests &= in_plane
         start = dr.select(touches, early, start)
     ray = mi.Ray3f(start, mi.Vector3f(towards))
-    hit = trace_to_surface(
+    hit = sheets.trace_to_surface(
         rays, inputs, ray, active, key, coherent=False, stratified_bits=stratified_bits
     )
     touches &= hit.point.face == touched

@@ -17,13 +17,9 @@ from torch.nn.functional import normalize
 from invertwin.channel.em.plane_waves import dot, phasor, plane_of_incidence, reflect_vectors
 from invertwin.channel.em.utd import outer_product
 from invertwin.channel.em.wedges import edge_axis
+from invertwin.channel.specular import diffraction_candidates
 from invertwin.channel.specular.corner_diffraction import diffract_round_corner
-from invertwin.channel.specular.diffraction_candidates import (
-    Corner,
-    DiffractionCandidates,
-    PathLegs,
-    face_azimuths,
-)
+from invertwin.channel.specular.diffraction_candidates import DiffractionCandidates, PathLegs
 from invertwin.channel.specular.edge_path_geometry import EdgePaths, PathEdge, diffract_over_edges
 from invertwin.channel.specular.image_method import UnfoldedPaths
 from invertwin.channel.specular.ray_paths import DIFFRACTION
@@ -62,7 +58,7 @@ class DiffractedPaths:
     transfer: Complex128[Tensor, "row 3 3"]
     slopes: Complex128[Tensor, "row 2 3 3"]
     axes: Float64[Tensor, "row 2 3"]
-    corner: Corner = None
+    corner: diffraction_candidates.Corner = None
 
 
 def evaluate_diffracted_paths(
@@ -84,7 +80,7 @@ def evaluate_diffracted_paths(
     after = PathLegs(candidates.after.faces.flip(1), candidates.after.transmitted.flip(1))
     sides = (candidates.before, source), (after, target)
     legs = [_AntennaLeg(wedge_scene, *side) for side in sides]
-    angles = face_azimuths(wedge_scene, candidates)
+    angles = diffraction_candidates.face_azimuths(wedge_scene, candidates)
     incidence, departure = [None, *angles[..., 1].T], [*angles[..., 0].T, None]
     edges = [
         wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)

@@ -20,32 +20,22 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.utils.checkpoint import checkpoint
 
+from invertwin import checks
 from invertwin.channel.em import plane_waves
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import connect_surfaces, vertex_velocities
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.specular import image_method
 from invertwin.channel.specular.candidates import FaceInteractions, find_sequences
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import (
     DiffractionCandidates,
     find_diffraction_candidates,
 )
-from invertwin.channel.specular.image_method import (
-    CandidateSurfaces,
-    SpecularPaths,
-    UnfoldedPaths,
-    find_paths_along,
-)
+from invertwin.channel.specular.image_method import CandidateSurfaces, SpecularPaths, UnfoldedPaths
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join_ray_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
-from invertwin.checks import (
-    ArrayLike,
-    checked_count,
-    checked_number,
-    checked_rows,
-    checked_tensor,
-    strip_derivatives,
-)
+from invertwin.checks import ArrayLike, checked_count, checked_tensor, strip_derivatives
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.limits import MAX_COUNT
 from invertwin.runtime.memory import require_at_most
@@ -175,7 +165,7 @@ def _find_specular(
     swapped = len(bare.rx) < len(bare.tx)
     sources, targets = (bare.rx, bare.tx) if swapped else (bare.tx, bare.rx)
     sequences = find_sequences(surfaces, interactions, sources, depth, rays, seed)
-    found = find_paths_along(surfaces, sequences.steps, sources, targets)
+    found = image_method.find_paths_along(surfaces, sequences.steps, sources, targets)
     return [group.reverse() if swapped else group for group in found], sequences.missed_fraction
 
 
@@ -199,14 +189,14 @@ def prepare_path_scene(
         InputError: a cloud in the scene, or antennas of wrong shape.
     """
     topology, vertices = connect_surfaces(scene)
-    ends = checked_rows(tx, "tx positions [m]"), checked_rows(rx, "rx positions [m]")
+    ends = checks.checked_rows(tx, "tx positions [m]"), checks.checked_rows(rx, "rx positions [m]")
     given = zip((tx_velocity, rx_velocity), map(len, ends), ("tx", "rx"), strict=True)
     tx_speed, rx_speed = itertools.starmap(_check_velocities, given)
     objects, velocities = scene.objects.values(), None
     if any(item.velocity is not None for item in objects):
         velocities = torch.cat([vertex_velocities(item) for item in objects])
     surfaces = scene, topology, vertices, velocities
-    frequency = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
+    frequency = checks.checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
     return PathScene(*surfaces, *ends, tx_speed, rx_speed, frequency)
 
 

@@ -14,14 +14,9 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
+from invertwin.channel.em import wedges as sharp_edges
 from invertwin.channel.em.plane_waves import dot
-from invertwin.channel.em.wedges import (
-    Wedges,
-    azimuth,
-    edge_axis,
-    find_wedges,
-    merge_collinear_wedges,
-)
+from invertwin.channel.em.wedges import Wedges, edge_axis, find_wedges
 from invertwin.channel.rays.edge_crossings import find_crossings, split_at_crossings
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.specular.edge_path_geometry import PathEdge
@@ -150,8 +145,8 @@ class WedgeScene:
 
 
 def _sharp_edges(vertices: Tensor, topology: Topology) -> Wedges:
-    ends = vertices[topology.edges]
-    return merge_collinear_wedges(find_wedges(vertices[topology.faces], ends, topology.edge_faces))
+    wedges = find_wedges(vertices[topology.faces], vertices[topology.edges], topology.edge_faces)
+    return sharp_edges.merge_collinear_wedges(wedges)
 
 
 def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
@@ -162,7 +157,7 @@ def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor
         points: positions, [row, 3] [m].
     """
     offset = (points - wedges.start).detach()
-    angle = azimuth(wedges, offset, 0).detach()
+    angle = sharp_edges.azimuth(wedges, offset, 0).detach()
     inside = (angle > wedges.opening.detach() * torch.pi + _GRAZING_TOLERANCE) & (
         angle < 2 * torch.pi - _GRAZING_TOLERANCE
     )
