@@ -44,7 +44,7 @@ from invertwin.scene.scene import Scene
 
 _MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
-_DIFFRACTED_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
+_EDGE_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
 _UP = (0.0, 0.0, 1.0)
 _AT_REST = (0.0, 0.0, 0.0)
 _Columns = dict[str, Tensor]  # columns of `RayPaths` by name
@@ -148,8 +148,9 @@ def trace_paths(
             diffracted = list(find_diffraction_candidates(wedges, interactions, *ends, *options))
         paths = [part for group in specular for part in evaluate_paths(path_scene, group)]
         wedge_scene = _wedge_scene(path_scene, surfaces)
-        for candidates in diffracted:
-            paths += _evaluate_diffracted(path_scene, wedge_scene, candidates)
+        for some in diffracted:
+            columns = partial(_diffracted_columns, path_scene, wedge_scene, some)
+            paths += _evaluate_in_chunks(path_scene, some.tx, some.rx, _EDGE_ROWS_AT_ONCE, columns)
     return replace(join_ray_paths(paths), missed_fraction=missed)
 
 
@@ -225,18 +226,6 @@ def _wedge_scene(path_scene: PathScene, surfaces: CandidateSurfaces) -> WedgeSce
     return WedgeScene(path_scene.vertices, path_scene.topology, surfaces, coefficients)
 
 
-def _evaluate_diffracted(
-    path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
-) -> list[RayPaths]:
-    """Evaluate diffracted paths in chunks, as ``evaluate_paths``."""
-
-    def columns(rows: Tensor) -> _Columns:
-        return _diffracted_columns(path_scene, wedge_scene, candidates.select(rows))
-
-    ends, size = (candidates.tx, candidates.rx), _DIFFRACTED_ROWS_AT_ONCE
-    return _evaluate_in_chunks(path_scene, *ends, size, columns)
-
-
 def _evaluate_in_chunks(
     path_scene: PathScene, tx: Tensor, rx: Tensor, size: int, columns: Callable[[Tensor], _Columns]
 ) -> list[RayPaths]:
@@ -261,9 +250,10 @@ def _evaluate_in_chunks(
 
 
 def _diffracted_columns(
-    path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates
+    path_scene: PathScene, wedge_scene: WedgeScene, candidates: DiffractionCandidates, rows: Tensor
 ) -> _Columns:
     """Columns of diffracted paths."""
+    candidates = candidates.select(rows)
     k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
     ways = found.directions.unbind(1)
