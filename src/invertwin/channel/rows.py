@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
+from jaxtyping import Int64, Num
 from torch import Tensor
 
 Table = TypeVar("Table", bound="Rows")
@@ -35,3 +36,18 @@ def concatenate_rows(parts: Sequence[Table], **columns: Tensor) -> Table:
     names = [n for n, v in vars(parts[0]).items() if isinstance(v, Tensor) and n not in columns]
     joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **joined, **columns)
+
+
+def bound_groups(
+    group: Int64[Tensor, " row"], values: Num[Tensor, "row column"], count: int
+) -> tuple[Num[Tensor, "group column"], Num[Tensor, "group column"]]:
+    """Compute the smallest and the largest values of each group of rows; zero without rows.
+
+    Args:
+        group: number of the group of each row.
+        values: numbers of each row.
+        count: number of groups.
+    """
+    rows, zero = group[:, None].expand_as(values), values.new_zeros(count, values.shape[1])
+    low = zero.scatter_reduce(0, rows, values, "amin", include_self=False)
+    return low, zero.scatter_reduce(0, rows, values, "amax", include_self=False)

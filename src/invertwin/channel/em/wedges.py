@@ -25,7 +25,7 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot, phasor
 from invertwin.channel.em.transition_functions import EXP_J_PI_4, transition
-from invertwin.channel.rows import Rows, concatenate_rows
+from invertwin.channel.rows import Rows, bound_groups, concatenate_rows
 from invertwin.checks import strip_derivatives
 from invertwin.scene.mesh_topology import label_components
 
@@ -158,10 +158,7 @@ def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]
         pairs.append(torch.stack([own[continued], other[continued]]) % count)
     line = torch.from_numpy(label_components(torch.cat(pairs, 1).T.numpy(), count))
     lines = int(line.max()) + 1
-    index = line.repeat(2)[:, None].expand(-1, 3)
-    none = torch.zeros(lines, 3, dtype=torch.float64)
-    low = none.scatter_reduce(0, index, ends, "amin", include_self=False)
-    high = none.scatter_reduce(0, index, ends, "amax", include_self=False)
+    low, high = bound_groups(line.repeat(2), ends, lines)
     short = (high - low).norm(dim=1) < min_length
     kept, previous = torch.ones(lines, dtype=torch.bool), -1
     # Removing a line may leave the next one with a loose end.

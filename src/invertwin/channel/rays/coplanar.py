@@ -12,6 +12,7 @@ from invertwin.channel.em.plane_waves import barycentric_coordinates, triangle_n
 from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.intersections import find_overlapping_boxes
 from invertwin.channel.rays.scene_tables import Geometry
+from invertwin.channel.rows import bound_groups
 from invertwin.checks import strip_derivatives
 from invertwin.errors import InputError, PhysicsWarning
 
@@ -143,13 +144,9 @@ def _find_seen_pairs(
 
 def _relevant_pairs(geometry: Geometry) -> _ObjectPairs:
     """Find pairs of objects of which one moves, or whose materials differ."""
-    count, owner = len(geometry.names), geometry.face_object
-    lowest, highest = (
-        torch.zeros(count, dtype=torch.int64).scatter_reduce(
-            0, owner, geometry.face_surface, how, include_self=False
-        )
-        for how in ("amin", "amax")
-    )
+    rows = geometry.face_surface[:, None]
+    bounds = bound_groups(geometry.face_object, rows, len(geometry.names))
+    lowest, highest = bounds[0][:, 0], bounds[1][:, 0]
     moving = torch.tensor(geometry.differentiated)
     pairs = moving[:, None] | moving
     pairs |= (lowest[:, None] != lowest) | (lowest != highest)[:, None] | (lowest != highest)

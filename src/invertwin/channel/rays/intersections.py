@@ -15,7 +15,7 @@ from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import Topology
-from invertwin.channel.rows import Rows, concatenate_rows
+from invertwin.channel.rows import Rows, bound_groups, concatenate_rows
 
 _Numbers = Int64[Tensor, " n"]
 PLANE_TOLERANCE = 1e-9  # closer than this to a plane [m] is in it
@@ -82,10 +82,7 @@ def find_overlapping_boxes(
     Returns:
         The pairs, and per object the bounds of all overlaps, low and high [m].
     """
-    owner = topology.vertex_object[:, None].expand(-1, 3)
-    none = vertices.new_zeros(len(pairs), 3)
-    low = none.scatter_reduce(0, owner, vertices, "amin", include_self=False)
-    high = none.scatter_reduce(0, owner, vertices, "amax", include_self=False)
+    low, high = bound_groups(topology.vertex_object, vertices, len(pairs))
     margin = 1e-5 * (high - low).amax().clamp_min(1.0)
     low, high = low - margin, high + margin
     for axis in range(3):

@@ -27,7 +27,7 @@ from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
-from invertwin.channel.rows import Rows
+from invertwin.channel.rows import Rows, bound_groups
 
 _StepNumbers = Int64[Tensor, "row step"]
 _StepVectors = Float64[Tensor, "row step 3"]
@@ -607,10 +607,7 @@ def find_planes(vertices: Float64[Tensor, "v 3"], faces: Int64[Tensor, "f 3"]) -
     axes = torch.stack([first, torch.linalg.cross(normal[best], first)], 1)
     point = corners[valid[best], 0]
     coordinates = torch.einsum("fcx,fax->fca", corners[valid] - point[plane, None], axes[plane])
-    ends = torch.full((count, 2), torch.inf, dtype=torch.float64)
-    rows = plane[:, None].expand(-1, 2)
-    low = ends.scatter_reduce(0, rows, coordinates.amin(1), "amin")
-    high = (-ends).scatter_reduce(0, rows, coordinates.amax(1), "amax")
+    low, high = bound_groups(plane.repeat_interleave(3), coordinates.flatten(0, 1), count)
     face_plane = torch.full((len(faces),), -1, dtype=torch.int64)
     face_plane[valid] = plane
     return Planes(face_plane, point, normal[best], axes, low, high)
