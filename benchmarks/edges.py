@@ -148,14 +148,13 @@ class Estimator:
             ),
         ):
             points = boundary.BoundarySamples(
-                self.rays,
                 self.inputs,
                 Sampling(depth=DEPTH, boundary_samples=FAMILIES * samples),
                 seed,
                 chunks=lambda size: iter([dr.arange(mi.UInt32, size)] if size else []),
             )
-            walk = RandomWalk(self.rays, self.inputs, seed)
-            for paths in boundary.trace_boundary_paths(self.rays, attached, walk, points):
+            walk = RandomWalk(self.inputs, seed)
+            for paths in boundary.trace_boundary_paths(attached, walk, points):
                 total = paths.sum_weighted(lambda _, exists: dr.select(exists, mi.Float(1.0), 0.0))
                 dr.backward_from(paths.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()

@@ -29,7 +29,7 @@ def gradients(
     for records in trace.iterate_records():
         number, antennas = mi.UInt32(0), replay._locate_antennas(inputs, records.frame)
         near = replay._VertexNeighbours.read(inputs, records, number, records.depth)
-        vertex = replay._evaluate_vertex(trace.rays, inputs, records, antennas, number, near)
+        vertex = replay._evaluate_vertex(inputs, records, antennas, number, near)
         path, arriving = vertex.to_contribution(), vertex.incident_factor
         power = dr.select(vertex.is_visible, path.power * (arriving / dr.detach(arriving)), 0)
         length = 0.5 * (vertex.optical_length + vertex.connection.distance)

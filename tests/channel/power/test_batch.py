@@ -244,8 +244,8 @@ def test_scenes_far_and_near_get_as_many_boundary_samples():
         edges = rays.topology.edges
         scene = rays.topology.vertex_object[edges[:, 0]] // 2
         samplers = (
-            SilhouetteSampler(rays, inputs, ("tx", "rx"), 100, 1),
-            InteriorSilhouetteSampler(rays, inputs, 100, 1),
+            SilhouetteSampler(inputs, ("tx", "rx"), 100, 1),
+            InteriorSilhouetteSampler(inputs, 100, 1),
         )
         for sampler in samplers:
             weights = to_torch(sampler.choice.weights).reshape(-1, len(edges)).sum(0)

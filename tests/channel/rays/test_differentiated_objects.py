@@ -60,7 +60,7 @@ def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
     with tracing():
         geometry = flatten(scene, WAVELENGTH)
         rays = RayScene(geometry, link(), differentiate_antennas=False)
-        sampler = SilhouetteSampler(rays, Inputs.from_rays(rays), ("tx",), samples, 1)
+        sampler = SilhouetteSampler(Inputs.from_rays(rays), ("tx",), samples, 1)
         points = sampler.draw(dr.arange(mi.UInt32, samples)).compress()
         first, face = to_torch(mi.Int32(points.first_vertex)), to_torch(mi.Int32(points.face))
         owner = geometry.topology.vertex_object
@@ -207,7 +207,7 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
         with tracing():
             geometry = flatten(scene, WAVELENGTH)
             rays = RayScene(geometry, link(), differentiate_antennas=False)
-            sampler = InteriorSilhouetteSampler(rays, Inputs.from_rays(rays), 100_000, 1)
+            sampler = InteriorSilhouetteSampler(Inputs.from_rays(rays), 100_000, 1)
             points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
             owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first_vertex)).long()]
             return int((owner != 2).sum())

@@ -112,7 +112,7 @@ def trace_shadow_boundary_paths(
     count = samples // len(centres) * len(centres)
     resting = dr.zeros(mi.UInt32, len(rays.topology.edges))
     inputs = Inputs.from_rays(rays)
-    sampler = SilhouetteSampler(rays, inputs, centres, count, seed, resting=resting)
+    sampler = SilhouetteSampler(inputs, centres, count, seed, resting=resting)
     if not sampler.size:
         return []
     edge = project_silhouettes(rays, sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress())

@@ -76,7 +76,7 @@ class _RoughPathSampler:
         self.geometry, self.link = geometry, link
         self.rays = RayScene(geometry, link)
         self.inputs = integrand.Inputs.from_rays(self.rays)
-        self.walk = walk.RandomWalk(self.rays, self.inputs, seed)
+        self.walk = walk.RandomWalk(self.inputs, seed)
         self.seeds = arrays.scramble_seed(seed, 12), arrays.scramble_seed(seed, 13)
         self.generator = torch.Generator().manual_seed(seed)
         areas = face_areas(geometry)

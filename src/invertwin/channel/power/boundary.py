@@ -23,7 +23,6 @@ from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSamp
 from invertwin.channel.rays.arrays import opaque, to_index
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
-from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.surface_point import SurfacePoint
 from invertwin.channel.sampling import Sampling
 
@@ -31,7 +30,7 @@ _SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their
 
 
 _PathBuilder = Callable[..., Iterator[intersection_curves.PathParts]]
-"""Function of the ray scene, attached inputs, a walker, sampled points and the depth."""
+"""Function of attached inputs, a walker, sampled points and the depth."""
 
 
 @runtime_checkable
@@ -98,7 +97,6 @@ class BoundarySamples:
     both antennas, a path of one vertex has one segment, not two.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         sampling: number of points over all families, and most vertices of a path.
         seed: seed of the points.
@@ -108,7 +106,6 @@ class BoundarySamples:
 
     def __init__(
         self,
-        rays: RayScene,
         inputs: Inputs,
         sampling: Sampling,
         seed: int,
@@ -116,7 +113,8 @@ class BoundarySamples:
         *,
         chunks: Callable[[int], Iterator[mit.UInt32]],
     ) -> None:
-        self.depth = depth = sampling.depth
+        rays, depth = inputs.rays, sampling.depth
+        self.depth = depth
         samples = sampling.boundary_samples * rays.scene_count
         centres = ("tx",) if rays.link.shared_visibility and depth == 1 else ("tx", "rx")
         inner = depth > 1 and sampling.interior_edges
@@ -128,14 +126,14 @@ class BoundarySamples:
         resting = to_index(rests) if sampling.contacts else None
         share = samples // (len(centres) + inner + meet)
         count = len(centres) * share
-        antennas = SilhouetteSampler(rays, inputs, centres, count, seed, resting=resting)
+        antennas = SilhouetteSampler(inputs, centres, count, seed, resting=resting)
         found: list[tuple[_Sampler, _PathBuilder]] = [(antennas, _antenna_silhouette_paths)]
         if inner:
-            inside = InteriorSilhouetteSampler(rays, inputs, share, seed + 2, resting=resting)
+            inside = InteriorSilhouetteSampler(inputs, share, seed + 2, resting=resting)
             found.append((inside, _interior_silhouette_paths))
         if curves is not None and meet:
             contacts = intersection_curves.IntersectionCurveSampler(
-                rays, inputs, curves, share, depth, seed
+                inputs, curves, share, depth, seed
             )
             found.append((contacts, intersection_curves.intersection_curve_paths))
         self._samplers, self._path_builders = zip(*found, strict=True)
@@ -166,7 +164,7 @@ class BoundarySamples:
 
 
 def trace_boundary_paths(
-    rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: BoundarySamples
+    inputs: Inputs, walker: RandomWalk, samples: BoundarySamples
 ) -> Iterator[BoundaryPaths]:
     """Trace the boundary paths through sampled points.
 
@@ -174,7 +172,6 @@ def trace_boundary_paths(
     runs.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         walker: random walk that extends the paths.
         samples: points on edges and intersection curves.
@@ -184,19 +181,19 @@ def trace_boundary_paths(
     def segments() -> Iterator[BoundaryPaths]:
         for kind, found in itertools.chain(*families):
             if found.size:
-                parts = kind(rays, inputs, walker, found, samples.depth)
+                parts = kind(inputs, walker, found, samples.depth)
                 yield from itertools.starmap(BoundaryPaths, parts)
 
     return segments()
 
 
 def _antenna_silhouette_paths(
-    rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
+    inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
 ) -> Iterator[intersection_curves.PathParts]:
     """First family: the shadow that an edge casts from an antenna, and the path to the other."""
     at_receiver = samples.is_receiver
     fixed, frame = inputs.detach(), samples.frame
-    shared = rays.link.shared_visibility
+    shared = inputs.rays.link.shared_visibility
 
     def locate_shadow() -> tuple[SurfacePoint, mit.Float]:
         return shadow_speed(inputs, samples, inputs.antenna_position(frame, at_receiver))
@@ -214,7 +211,7 @@ def _antenna_silhouette_paths(
             # If one test serves both antennas, single vertices count in the transmitter's shadows.
             least = dr.select(to_receiver, 1, 2) if shared and to_receiver is not True else 1
             path, exists = walk.connect_path(
-                rays, fixed, state, point, to_receiver, min_vertices=least, shared_visibility=shared
+                fixed, state, point, to_receiver, min_vertices=least, shared_visibility=shared
             )
             visit(state, path, exists)
 
@@ -232,7 +229,7 @@ def _antenna_silhouette_paths(
 
 
 def _interior_silhouette_paths(
-    rays: RayScene, inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
+    inputs: Inputs, walker: RandomWalk, samples: SilhouetteSample, depth: int
 ) -> Iterator[intersection_curves.PathParts]:
     """Second family: a shadow that one surface point casts past an edge on another surface.
 
@@ -262,7 +259,7 @@ def _interior_silhouette_paths(
 
     def run(state: PathState, visit: intersection_curves.PathVisitor) -> PathState:
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
-            visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
+            visit(state, *walk.connect_path(fixed, state, point, state["to_receiver"]))
 
         return walker.run(state, choices + 1 - count, visit_connection)
 

@@ -286,7 +286,7 @@ def _pull_gradients(ctx: Any, names: tuple[str, ...], grad: Tensor) -> tuple[Ten
 
         boundary = tracer.trace_boundary(inputs)
         for records in [tracer.last_records] if tracer.last_records else tracer.iterate_records():
-            replay.pull(tracer.rays, inputs, records, gather)
+            replay.pull(inputs, records, gather)
             dr.eval([dr.grad(table) for table in tables.values()])
             del records  # before the next ones are allocated
         for paths in boundary:
@@ -314,7 +314,7 @@ def _push_tangents(ctx: Any, names: tuple[str, ...], *tangents: Tensor) -> Tenso
         boundary = tracer.trace_boundary(inputs)
         for records in [tracer.last_records] if tracer.last_records else tracer.iterate_records():
             set_tangents()
-            replay.push(tracer.rays, inputs, records, out.add_tangent)
+            replay.push(inputs, records, out.add_tangent)
             dr.eval(out.values)
             del records
         for paths in boundary:

@@ -47,19 +47,19 @@ def from_table(name: str, values: mit.Float, like: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Flat Dr.Jit arrays; those named in ``DIFFERENTIABLE`` may carry derivatives.
+    """Ray scene and its flat Dr.Jit arrays; ``DIFFERENTIABLE`` names those with derivatives.
 
     Attributes:
         vertices: vertex positions about the local origin [m], see ``to_points``.
         tx, rx: positions of the transmitter and the receiver in every frame, likewise.
         rotations: rotation of the radar in every frame.
         surfaces: tables of the scattering laws.
-        faces: vertex indices of every triangle.
         face_surface: row of every triangle in the tables of surfaces.
         triangles: ``RayScene.triangles``, used if the vertices carry no derivatives.
         monostatic: True if both antennas are one.
         tx_pattern, rx_pattern: antenna patterns.
         scale: (λ/4π)² [m²].
+        rays: ray scene.
         coupling: polarisation factors of paths with an odd and an even number of bounces.
     """
 
@@ -68,13 +68,13 @@ class Inputs:
     rx: mit.Float
     rotations: mit.Float
     surfaces: ScatteringLawTables
-    faces: mit.UInt32
     face_surface: mit.UInt32
     triangles: mit.Float
     monostatic: bool
     tx_pattern: PatternTable
     rx_pattern: PatternTable
     scale: float
+    rays: RayScene
     coupling: tuple[float, float] = (1.0, 1.0)
 
     @staticmethod
@@ -93,13 +93,13 @@ class Inputs:
             rx=rays.rx,
             rotations=arrays.to_float(link.rotations),
             surfaces=ScatteringLawTables.from_geometry(rays.geometry),
-            faces=rays.topology.device_corners,
             face_surface=arrays.to_index(rays.geometry.face_surface),
             triangles=rays.triangles,
             monostatic=monostatic,
             tx_pattern=PatternTable.from_pattern(link.tx_pattern),
             rx_pattern=PatternTable.from_pattern(link.rx_pattern),
             scale=(link.wavelength / (4 * np.pi)) ** 2,
+            rays=rays,
         )
 
     def table(self, name: str) -> mit.Float:
@@ -205,7 +205,7 @@ def corners(inputs: Inputs, face: mit.UInt32, active: mit.Bool | bool = True) ->
         face: triangle indices.
         active: mask of active lanes.
     """
-    return surface_point.corners(inputs.vertices, inputs.faces, face, active)
+    return surface_point.corners(inputs.vertices, inputs.rays.topology.device_corners, face, active)
 
 
 @dataclass

@@ -9,7 +9,6 @@ from invertwin.channel.power.mesh_folds import is_hidden_by_fold
 from invertwin.channel.rays.arrays import gather_points, sample_sphere, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
-from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.surface_point import face_normal, interpolate_position
 
 
@@ -20,7 +19,6 @@ class InteriorSilhouetteSampler:
     and by the proximity to both antennas; directions are uniform over the tangential ones.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         samples: number of points over all frames and scenes.
         seed: seed of the points.
@@ -32,7 +30,6 @@ class InteriorSilhouetteSampler:
 
     def __init__(
         self,
-        rays: RayScene,
         inputs: Inputs,
         samples: int,
         seed: int,
@@ -40,7 +37,7 @@ class InteriorSilhouetteSampler:
         importance_sampling: bool = True,
         resting: mit.UInt32 | None = None,
     ) -> None:
-        topology = rays.topology
+        rays, topology = inputs.rays, inputs.rays.topology
         self.rays, self.inputs = rays, inputs
         self.importance_sampling, self.resting = importance_sampling, resting
         edge = dr.arange(mi.UInt32, len(topology.edges))
@@ -133,14 +130,14 @@ class InteriorSilhouetteSampler:
                 moving, index, edge, exact_point, omega, density
             )
         exact = mi.Vector3d(omega)
-        sides = silhouettes.classify_sides(rays, self.inputs, edge, exact)
+        sides = silhouettes.classify_sides(self.inputs, edge, exact)
         aside = silhouettes.EDGE_OFFSET * (dr.norm(exact_point) + dr.norm(y1 - y0))
         y, beside = mi.Point3f(exact_point), mi.Point3f(exact_point + sides.outward * aside)
         valid = (pmf > 0) & sides.has_contrast
         hits = []
         for sign, seed in zip((-1.0, 1.0), self.transmission_seeds, strict=True):
             hit = silhouettes.trace_past_edge(
-                rays, self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
+                self.inputs, (edge, along), beside, omega * (sign * dr.norm(y)), valid,
                 (index, seed), resting=self.resting if sign > 0 else None,
             )  # fmt: skip
             valid &= hit.valid & silhouettes.is_not_grazing(rays, hit.point.face, omega, hit.valid)

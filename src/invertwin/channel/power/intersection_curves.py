@@ -26,7 +26,7 @@ from invertwin.channel.power.transmission import (
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.ray_scene import RAY_EPSILON
 from invertwin.channel.rays.surface_point import SurfacePoint, barycentric_coordinates
 from invertwin.errors import InputError
 
@@ -70,7 +70,6 @@ class IntersectionCurveSampler:
     """Sampler of points on intersection curves and of the directions from which paths arrive.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         curves: segments of the curves.
         samples: number of points.
@@ -80,14 +79,14 @@ class IntersectionCurveSampler:
 
     def __init__(
         self,
-        rays: RayScene,
         inputs: Inputs,
         curves: IntersectionCurves,
         samples: int,
         depth: int,
         seed: int,
     ) -> None:
-        self.rays, self.inputs, self.size, self.depth = rays, inputs, samples, depth
+        self.rays = rays = inputs.rays
+        self.inputs, self.size, self.depth = inputs, samples, depth
         ends = [(end - rays.origin).float() for end in (curves.start, curves.end)]
         self.ends = list(map(arrays.to_points, ends))
         self.faces = [arrays.to_index(face) for face in (curves.first, curves.second)]
@@ -136,13 +135,13 @@ class IntersectionCurveSampler:
             sphere = arrays.sample_sphere(*arrays.uniform_pair(index, self.seeds[1]))
             incident = dr.select(count > 0, sphere, incident)
         origin = _offset_into_wedge(interactions[0], normals, incident).position
-        transmission = trace_transmission(rays, inputs, origin, antenna, valid & (count == 0))
+        transmission = trace_transmission(inputs, origin, antenna, valid & (count == 0))
         exists = transmission.transmittance > 0
         source = SurfacePoint(mi.UInt32(0), mi.Float(0.0), mi.Float(0.0))
         hit_probability = mi.Float(1.0)
         if deep:
             ray, key = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(incident)), (index, self.seeds[2])
-            hit = trace_to_surface(rays, inputs, ray, valid & (count > 0), key, coherent=False)
+            hit = trace_to_surface(inputs, ray, valid & (count > 0), key, coherent=False)
             exists |= hit.valid & rays.is_in_scene(frame, hit.point.face, hit.valid)
             hit_probability, source = hit.probability, hit.point
             transmission = dr.select(count > 0, hit.transmission, transmission)
@@ -218,18 +217,15 @@ class _IncidentSubpath:
         keys: keys of the path state at the curve.
     """
 
-    def __init__(
-        self, rays: RayScene, fixed: Inputs, walker: RandomWalk, points: IntersectionPoint,
-        depth: int,
-    ) -> None:  # fmt: skip
+    def __init__(self, walker: RandomWalk, points: IntersectionPoint, depth: int) -> None:
         frame, index, added = points.frame, points.index, points.transmission.extra_length
-        self.rays, self.fixed, self.walker, self.depth = rays, fixed, walker, depth
+        self.fixed, self.walker, self.depth = walker.inputs, walker, depth
         self.points = points
-        spots = points.first, points.second
+        fixed, spots = walker.inputs, (points.first, points.second)
         self.interactions = [integrand.compute_interaction(fixed, spot) for spot in spots]
         here = self.interactions[0]
         self.count, self.at_receiver = count, at_receiver = decode_subpath(index, depth)
-        self.shared = rays.link.shared_visibility and depth == 1
+        self.shared = walker.rays.link.shared_visibility and depth == 1
         self.other_end = True if isinstance(at_receiver, bool) else ~at_receiver
         antenna = fixed.antenna_position(frame, at_receiver)
         incident, distance = integrand.direction_and_distance(here.position, antenna)
@@ -332,14 +328,14 @@ class _CoveredSide:
             visit: function of the state, a path, and the mask of lanes in which it exists.
         """
         before, walker = self.subpath, self.subpath.walker
-        rays, fixed, depth = before.rays, before.fixed, before.depth
+        fixed, depth = before.fixed, before.depth
         here, normals = before.interactions[self.own], before.normals
         target = before.at_receiver if before.shared else before.other_end
         end = fixed.antenna_position(before.points.frame, target)
         onwards, _ = integrand.direction_and_distance(here.position, end)
         point = _offset_into_wedge(here, normals, onwards)
         path, exists = walk.connect_path(
-            rays, fixed, state, point, before.other_end, shared_visibility=before.shared
+            fixed, state, point, before.other_end, shared_visibility=before.shared
         )
         passed = self.transmit(onwards)
         power, length = path.power * passed.transmittance, path.range + 0.5 * passed.extra_length
@@ -349,7 +345,7 @@ class _CoveredSide:
             return state
 
         def visit_connection(state: PathState, point: SurfaceInteraction) -> None:
-            visit(state, *walk.connect_path(rays, fixed, state, point, state["to_receiver"]))
+            visit(state, *walk.connect_path(fixed, state, point, state["to_receiver"]))
 
         state["active"] &= before.count + 1 < arrays.opaque(depth)
         state = walker.step(state, _offset_into_wedge(here, normals, before.incident))
@@ -361,12 +357,11 @@ class _CoveredSide:
 
 
 def intersection_curve_paths(
-    rays: RayScene, inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
+    inputs: Inputs, walker: RandomWalk, points: IntersectionPoint, depth: int
 ) -> Iterator[PathParts]:
     """Create the boundary paths with a vertex on an intersection curve.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         walker: random walk that extends the paths.
         points: points on the curves.
@@ -375,17 +370,14 @@ def intersection_curve_paths(
     Returns:
         Velocity, initial state and walk of the paths of either surface, see ``BoundaryPaths``.
     """
-    fixed = inputs.detach()
-    subpath = _IncidentSubpath(rays, fixed, walker, points, depth)
+    subpath = _IncidentSubpath(walker, points, depth)
     for own, other in ((0, 1), (1, 0)):
-        for sign in (1.0, -1.0) if fixed.surfaces.has_sheets else (1.0,):
+        for sign in (1.0, -1.0) if inputs.surfaces.has_sheets else (1.0,):
             side = _CoveredSide(subpath, own, other, sign)
             yield side.speed(inputs), side.initial_state(), side.run
 
 
 def require_no_interreflection(
-    rays: RayScene,
-    fixed: Inputs,
     walker: RandomWalk,
     curves: IntersectionCurves,
     depth: int,
@@ -397,7 +389,6 @@ def require_no_interreflection(
     scatter it.
 
     Args:
-        rays: ray scene.
         fixed: detached inputs.
         walker: random walk that extends the paths.
         curves: intersection curves.
@@ -407,8 +398,9 @@ def require_no_interreflection(
     Raises:
         InputError: There are such paths.
     """
+    rays, fixed = walker.rays, walker.inputs
     samples = _CHECKED_POINTS * rays.scene_count
-    sampler = IntersectionCurveSampler(rays, fixed, curves, samples, depth - 1, seed)
+    sampler = IntersectionCurveSampler(fixed, curves, samples, depth - 1, seed)
     points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
     if not points.size:
         return
@@ -417,7 +409,7 @@ def require_no_interreflection(
         state["exists"] = state["exists"] | exists
 
     scattered = [dr.zeros(mi.Bool, points.size) for _ in range(2)]
-    families = intersection_curve_paths(rays, fixed, walker, points, depth - 1)
+    families = intersection_curve_paths(fixed, walker, points, depth - 1)
     for number, (_, state, run) in enumerate(families):
         state["exists"] = dr.zeros(mi.Bool, points.size)
         scattered[number % 2] |= run(state, record_existing)["exists"]

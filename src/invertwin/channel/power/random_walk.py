@@ -20,7 +20,7 @@ from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.transmission import SegmentTransmission, trace_transmission
 from invertwin.channel.rays.arrays import opaque, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.ray_scene import RAY_EPSILON
 from invertwin.channel.rays.surface_point import SurfacePoint
 
 _MIN_SURVIVAL = 0.1  # least survival probability of Russian roulette
@@ -135,14 +135,12 @@ class RandomWalk:
     """Random walk that extends paths and calls a visitor at every vertex.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         seed: seed of the directions.
     """
 
-    def __init__(self, rays: RayScene, inputs: Inputs, seed: int) -> None:
-        self.rays = rays
-        self.inputs = inputs
+    def __init__(self, inputs: Inputs, seed: int) -> None:
+        self.rays, self.inputs = inputs.rays, inputs
         self.seed = scramble_seed(seed, 7)
 
     @cached_property
@@ -224,7 +222,7 @@ class RandomWalk:
         inputs = replace(self.inputs, coupling=(1.0, 1.0))
 
         def record_last(state: PathState, point: SurfaceInteraction) -> None:
-            path, exists = connect_path(self.rays, inputs, state, point, state["to_receiver"])
+            path, exists = connect_path(inputs, state, point, state["to_receiver"])
             last = exists & (state["number"] == state["last"])
             state["power"] = dr.select(last, path.power, state["power"])
             state["optical_length"] = dr.select(last, 2 * path.range, state["optical_length"])
@@ -263,7 +261,7 @@ class RandomWalk:
         origin = point.position + side * (RAY_EPSILON * dr.norm(point.position))
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(omega))
         key = state["index"], self.seed + (state["number"] * 5 + 4) * _STREAM_STEP
-        hit = sheets.trace_to_surface(self.rays, self.inputs, ray, active, key, coherent=False)
+        hit = sheets.trace_to_surface(self.inputs, ray, active, key, coherent=False)
         active &= hit.valid & self.rays.is_in_scene(state["frame"], hit.point.face, active)
         found = integrand.compute_interaction(self.inputs, hit.point, active)
         to_point, distance = integrand.direction_and_distance(found.position, point.position)
@@ -288,7 +286,6 @@ class RandomWalk:
 
 
 def connect_path(
-    rays: RayScene,
     inputs: Inputs,
     state: PathState,
     point: SurfaceInteraction,
@@ -302,7 +299,6 @@ def connect_path(
     """Connect the latest vertex to an antenna.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         state: state at the latest vertex.
         point: latest vertex.
@@ -332,7 +328,7 @@ def connect_path(
     transmittance, extra = state.get("transmittance", one), state.get("extra", none)
     if not (shared_visibility and "last" not in state):
         first = exists & (state["number"] == 1) if shared_visibility else mi.Bool(False)
-        passed = trace_transmission(rays, inputs, point.position, antenna.position, exists & ~first)
+        passed = trace_transmission(inputs, point.position, antenna.position, exists & ~first)
         transmittance = dr.select(first, transmittance, passed.transmittance)
         extra = dr.select(first, extra, passed.extra_length)
     length = 0.5 * (state["length"] + found.distance + extra)

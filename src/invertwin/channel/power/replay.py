@@ -148,7 +148,6 @@ def _locate_antennas(inputs: Inputs, frame: mit.UInt32) -> _Antennas:
 
 
 def _evaluate_vertex(
-    rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
     antennas: _Antennas,
@@ -196,10 +195,10 @@ def _evaluate_vertex(
     visible = active & vertex.is_visible
     twice, passed = mi.Bool(False), sheets.SegmentTransmission.clear()
     if inputs.surfaces.has_sheets:
-        twice = first if rays.link.shared_visibility else twice
+        twice = first if inputs.rays.link.shared_visibility else twice
         ends = dr.detach(here.position), dr.detach(dr.select(twice, before, receiver.position))
         with dr.suspend_grad():
-            passed = sheets.trace_transmission(rays, inputs.detach(), *ends, visible)
+            passed = sheets.trace_transmission(inputs.detach(), *ends, visible)
 
     def locate_attached() -> SurfaceInteraction | None:
         previous = neighbours.previous
@@ -356,7 +355,6 @@ class _PendingVertex:
 
 
 def pull(
-    rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
     gather: Callable[[PathContribution, mit.Bool], FourFloats],
@@ -364,7 +362,6 @@ def pull(
     """Reverse mode (vector–Jacobian product): add to the gradients of the attached inputs.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         records: vertices of the paths.
         gather: adjoints of paths: ∂loss/∂power, and power · ∂loss/∂(range, u, v).
@@ -385,7 +382,7 @@ def pull(
                 near = known.as_leaf_variables()
             else:
                 near = _VertexNeighbours.read(inputs, records, number, depth)
-            vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
+            vertex = _evaluate_vertex(inputs, records, antennas, number, near)
             path = vertex.to_contribution()
             seen, scattering = vertex.is_visible, vertex.scattering_factor
             power, length, u, v = (dr.select(seen, a, 0.0) for a in gather(path, seen))
@@ -403,23 +400,20 @@ def pull(
                 pending = pending.advance(inputs, near)
         if inputs.surfaces.has_sheets:
             own = power * dr.detach(path.power), 0.5 * length
-            _pull_sheets(rays, inputs, vertex, own, (power_sum, range_sum))
+            _pull_sheets(inputs, vertex, own, (power_sum, range_sum))
         return (power_sum, range_sum), pending
 
     initial = _PendingVertex.initialise(fixed, records, depth) if carried else None
-    pending = _sweep_vertices(rays, records, sweep, initial, backwards=True)
+    pending = _sweep_vertices(inputs.rays, records, sweep, initial, backwards=True)
     if pending:
         with dr.resume_grad():
             pending.pull(inputs, pending.following.exists)
 
 
-def _pull_sheets(
-    rays: RayScene, inputs: Inputs, vertex: _VertexFactors, own: Sums, sums: Sums
-) -> None:
+def _pull_sheets(inputs: Inputs, vertex: _VertexFactors, own: Sums, sums: Sums) -> None:
     """Add the gradients of the sheets on the segment before a vertex and on its connection.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         vertex: factors at the vertex.
         own: derivatives with respect to the logarithm of the power and to the length [m], of the
@@ -434,7 +428,7 @@ def _pull_sheets(
             factor = _log_derivative_factor(dr.detach(transmittance) > 0, sums[0], transmittance)
             dr.backward_from(factor * transmittance + sums[1] * extra)
 
-        sheets.visit_sheets(rays, inputs, start, vertex.endpoints[1], active, {}, act)
+        sheets.visit_sheets(inputs, start, vertex.endpoints[1], active, {}, act)
 
     sums = sums[0] + again[0], sums[1] + again[1]
     pull_segment(vertex.endpoints[0], vertex.active, sums)
@@ -442,7 +436,6 @@ def _pull_sheets(
 
 
 def push(
-    rays: RayScene,
     inputs: Inputs,
     records: PathRecords,
     scatter: Callable[[PathContribution, FourFloats, mit.Bool], None],
@@ -450,7 +443,6 @@ def push(
     """Forward mode (Jacobian–vector product): scatter every path with its tangents.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         records: vertices of the paths.
         scatter: function of paths, the tangents of their power, range, u and v, and the mask of
@@ -463,7 +455,7 @@ def push(
         growth, longer = sums
         with dr.resume_grad():
             near = _VertexNeighbours.read(inputs, records, number, depth)
-            vertex = _evaluate_vertex(rays, inputs, records, antennas, number, near)
+            vertex = _evaluate_vertex(inputs, records, antennas, number, near)
             path = vertex.to_contribution()
             segment = vertex.incident_factor, vertex.optical_length
             ending = path.power, vertex.connection.distance, path.u, path.v
@@ -478,8 +470,8 @@ def push(
         if inputs.surfaces.has_sheets:
             before, here, receiver = vertex.endpoints
             alone = vertex.is_visible & ~vertex.shares_segment
-            by_segment = _push_sheets(rays, inputs, before, here, vertex.active)
-            by_end = _push_sheets(rays, inputs, receiver, here, alone)
+            by_segment = _push_sheets(inputs, before, here, vertex.active)
+            by_end = _push_sheets(inputs, receiver, here, alone)
             growth, longer = growth + by_segment[0], longer + by_segment[1]
             more = by_end[0] + dr.select(vertex.shares_segment, by_segment[0], 0.0)
             further = by_end[1] + dr.select(vertex.shares_segment, by_segment[1], 0.0)
@@ -493,12 +485,10 @@ def push(
         growth = growth + _log_derivative_factor(vertex.has_next, scattered, scattering)
         return (growth, longer), pending
 
-    _sweep_vertices(rays, records, sweep, None)
+    _sweep_vertices(inputs.rays, records, sweep, None)
 
 
-def _push_sheets(
-    rays: RayScene, inputs: Inputs, start: Position, end: Position, active: mit.Bool
-) -> Sums:
+def _push_sheets(inputs: Inputs, start: Position, end: Position, active: mit.Bool) -> Sums:
     """Compute the tangents of the logarithmic transmittance and of the extra length [m]."""
 
     def act(carry: sheets.Carry, transmittance: mit.Float, extra: mit.Float) -> None:
@@ -509,7 +499,7 @@ def _push_sheets(
         carry["longer"] = carry["longer"] + dr.detach(tangents[1])
 
     zero = {name: dr.zeros(mi.Float, dr.width(active)) for name in ("growth", "longer")}
-    done, _ = sheets.visit_sheets(rays, inputs, start, end, active, zero, act)
+    done, _ = sheets.visit_sheets(inputs, start, end, active, zero, act)
     return done["growth"], done["longer"]
 
 

@@ -136,7 +136,6 @@ class SilhouetteSampler:
     differ.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         antennas: antennas whose silhouettes count: ``tx``, ``rx`` or both.
         samples: number of points over all frames and scenes.
@@ -147,7 +146,6 @@ class SilhouetteSampler:
 
     def __init__(
         self,
-        rays: RayScene,
         inputs: Inputs,
         antennas: Sequence[str],
         samples: int,
@@ -155,14 +153,14 @@ class SilhouetteSampler:
         *,
         resting: mit.UInt32 | None = None,
     ) -> None:
-        topology = rays.topology
+        rays, topology = inputs.rays, inputs.rays.topology
         self.rays, self.inputs, self.antennas = rays, inputs, antennas
         self.resting = resting
         entries = len(antennas) * rays.poses_per_scene * len(topology.edges)
         edge, _, receiver, origin = self._decode_entry(dr.arange(mi.UInt32, entries))
         y0, y1 = rays.exact_ends(edge)
         ends = [mi.Vector3d(y - mi.Vector3d(origin)) for y in (y0, y1)]
-        sides = classify_sides(rays, inputs, edge, 0.5 * (ends[0] + ends[1]))
+        sides = classify_sides(inputs, edge, 0.5 * (ends[0] + ends[1]))
         self.size = samples if entries else 0
         if self.size:
             angle = mi.Float(dr.atan2(dr.norm(dr.cross(*ends)), dr.dot(*ends)))
@@ -203,15 +201,15 @@ class SilhouetteSampler:
         y0, y1 = rays.exact_ends(edge)
         y = y0 + (y1 - y0) * mi.Float64(along)
         exact = y - mi.Vector3d(origin)
-        sides = classify_sides(rays, self.inputs, edge, exact)
+        sides = classify_sides(self.inputs, edge, exact)
         aside = EDGE_OFFSET * (dr.norm(y) + dr.norm(y1 - y0))
         beside, away = mi.Point3f(y + sides.outward * aside), mi.Vector3f(exact)
         reach = beside - away * _START_OFFSET if self.resting is not None else beside
-        before = sheets.trace_transmission(rays, self.inputs, reach, origin, pmf > 0)
+        before = sheets.trace_transmission(self.inputs, reach, origin, pmf > 0)
         valid = (pmf > 0) & (before.transmittance > 0) & sides.has_contrast
         ray = beside, away, valid, (index, self.transmission_seed)
         hit = trace_past_edge(
-            rays, self.inputs, (edge, along), *ray, resting=self.resting, stratified_bits=index
+            self.inputs, (edge, along), *ray, resting=self.resting, stratified_bits=index
         )
         face = hit.point.face
         valid &= hit.valid & is_not_grazing(rays, face, away, hit.valid)
@@ -256,21 +254,18 @@ class _EdgeSides:
         return ~(same_power & same_length)
 
 
-def classify_sides(
-    rays: RayScene, inputs: Inputs, edge: mit.UInt32, direction: mit.Vector3d
-) -> _EdgeSides:
+def classify_sides(inputs: Inputs, edge: mit.UInt32, direction: mit.Vector3d) -> _EdgeSides:
     """Sort an edge's triangles by their side of the plane through edge and direction.
 
     An opaque edge is a silhouette if one side is free. In float64: the triangles of a fine mesh
     are nearly edge-on at the boundary of a shadow.
 
     Args:
-        rays: ray scene.
         inputs: attached tables of the scene.
         edge: index of each edge.
         direction: direction from the shadowing point to the edge [lane, 3].
     """
-    topology = rays.topology
+    rays, topology = inputs.rays, inputs.rays.topology
     y0, y1 = rays.exact_ends(edge)
     plane = dr.cross(direction, y1 - y0)
     offsets, heights = [], []
@@ -301,7 +296,6 @@ def classify_sides(
 
 
 def trace_past_edge(
-    rays: RayScene,
     inputs: Inputs,
     edge_point: tuple[mit.UInt32, mit.Float],
     origin: mit.Point3f,
@@ -321,7 +315,6 @@ def trace_past_edge(
     that start close to a surface.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         edge_point: edges, and positions along them from 0 to 1.
         origin: origins of the rays, off the edge.
@@ -335,7 +328,7 @@ def trace_past_edge(
     towards, distance = dr.normalize(direction), dr.norm(direction)
     start = mi.Point3f(origin + direction * RAY_EPSILON)  # type: ignore[operator]
     touches = crossed = rests = mi.Bool(False)
-    touched = mi.UInt32(0)
+    rays, touched = inputs.rays, mi.UInt32(0)
     if resting is not None:
         early = mi.Point3f(origin - direction * _START_OFFSET)  # type: ignore[operator]
         reach = mi.Float(2 * _START_OFFSET * distance)
@@ -348,7 +341,7 @@ def trace_past_edge(
         start = dr.select(touches, early, start)
     ray = mi.Ray3f(start, mi.Vector3f(towards))
     hit = sheets.trace_to_surface(
-        rays, inputs, ray, active, key, coherent=False, stratified_bits=stratified_bits
+        inputs, ray, active, key, coherent=False, stratified_bits=stratified_bits
     )
     touches &= hit.point.face == touched
     # Motion that opens a gap and motion that closes it have two slopes: half of each counts.

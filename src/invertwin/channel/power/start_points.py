@@ -95,9 +95,7 @@ class RaySampler:
         centre = arrays.gather_points(rays.tx, frame)
         ray, key = mi.Ray3f(centre, direction), (index, self.transmission_seed)
         bits = _stratified_bits(column, row)
-        hit = sheets.trace_to_surface(
-            rays, inputs, ray, every, key, coherent=True, stratified_bits=bits
-        )
+        hit = sheets.trace_to_surface(inputs, ray, every, key, coherent=True, stratified_bits=bits)
         point = integrand.compute_interaction(inputs, hit.point)
         cosine = dr.maximum(dr.abs(dr.dot(point.normal, direction)), 1e-6)
         distance = dr.squared_norm(point.position - centre)
@@ -162,6 +160,6 @@ class AreaSampler:
         area = 0.5 * dr.norm(dr.cross(p1 - p0, p2 - p0))
         position = interpolate_position(triangle, b.x, b.y)
         tx = arrays.gather_points(rays.tx, frame)
-        passed = sheets.trace_transmission(rays, inputs, tx, position, mi.Bool(True))
+        passed = sheets.trace_transmission(inputs, tx, position, mi.Bool(True))
         weight = dr.select(passed.transmittance > 0, area / (pmf * self.per_frame), 0.0)
         return StartPoints(frame, SurfacePoint(face, b.x, b.y), weight, passed)

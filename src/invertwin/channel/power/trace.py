@@ -90,14 +90,12 @@ class PowerTracer:
         self.sampler = sampler(self.rays, sampling.samples * self.rays.scene_count, seed, reference)
         monostatic = bool((link.tx == link.rx).all())
         self.fixed = replace(Inputs.from_rays(self.rays, monostatic=monostatic), coupling=coupling)
-        self._walk = RandomWalk(self.rays, self.fixed, seed)
+        self._walk = RandomWalk(self.fixed, seed)
         warn_coplanar_surfaces(self.rays)
         edges = sampling.boundary and sampling.contacts and sampling.boundary_samples
         self.curves = find_intersection_curves(self.rays) if edges else None
         if self.curves is not None and len(self.curves.first) and sampling.depth > 1:
-            require_no_interreflection(
-                self.rays, self.fixed, self._walk, self.curves, sampling.depth, seed
-            )
+            require_no_interreflection(self._walk, self.curves, sampling.depth, seed)
         self.chunk = max(1, int(sampling.memory_budget) // (_BYTES_PER_VERTEX * sampling.depth))
 
     def inputs(
@@ -149,7 +147,7 @@ class PowerTracer:
         def visit(state: PathState, point: SurfaceInteraction) -> None:
             nonlocal records
             found, exists = walk.connect_path(
-                self.rays, self.fixed, state, point, True,
+                self.fixed, state, point, True,
                 shared_visibility=shared, monostatic=monostatic, antenna=receiver,
             )  # fmt: skip
             if out is not None:
@@ -188,7 +186,7 @@ class PowerTracer:
             return None
         # No reference to this object: records would stay until garbage is collected.
         return BoundarySamples(
-            self.rays, self.fixed, sampling, self.seed, self.curves,
+            self.fixed, sampling, self.seed, self.curves,
             chunks=partial(index_chunks, chunk=self.chunk),
         )  # fmt: skip
 
@@ -200,7 +198,7 @@ class PowerTracer:
         """
         if self.boundary_samples is None:
             return iter(())
-        return trace_boundary_paths(self.rays, inputs, self._walk, self.boundary_samples)
+        return trace_boundary_paths(inputs, self._walk, self.boundary_samples)
 
 
 def index_chunks(size: int, chunk: int) -> Iterator[mit.UInt32]:

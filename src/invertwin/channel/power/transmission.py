@@ -15,7 +15,7 @@ from invertwin.channel.power import integrand
 from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.rays.arrays import opaque, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
+from invertwin.channel.rays.ray_scene import RAY_EPSILON
 from invertwin.channel.rays.surface_point import SurfacePoint
 
 _MAX_SHEETS = 32  # most surfaces on a segment
@@ -74,18 +74,17 @@ class _SurfaceState(TypedDict):
 
 
 def trace_transmission(
-    rays: RayScene, inputs: Inputs, start: mit.Point3f, end: mit.Point3f, active: mit.Bool
+    inputs: Inputs, start: mit.Point3f, end: mit.Point3f, active: mit.Bool
 ) -> SegmentTransmission:
     """Trace the transmission between two points (their own surfaces excluded). Detached.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         start, end: ends of the segment.
         active: mask of active lanes.
     """
     if not inputs.surfaces.has_sheets:
-        clear = rays.is_clear(start, end, active)
+        clear = inputs.rays.is_clear(start, end, active)
         return SegmentTransmission(dr.select(clear, 1.0, 0.0), mi.Float(0.0))
     lanes = dr.width(active)
     initial = {"transmittance": dr.ones(mi.Float, lanes), "extra": dr.zeros(mi.Float, lanes)}
@@ -94,15 +93,12 @@ def trace_transmission(
         carry["transmittance"] = carry["transmittance"] * transmittance
         carry["extra"] = carry["extra"] + extra
 
-    done, blocked = visit_sheets(
-        rays, inputs, lambda: start, lambda: end, active, initial, multiply
-    )
+    done, blocked = visit_sheets(inputs, lambda: start, lambda: end, active, initial, multiply)
     transmittance = dr.select(active & ~blocked, done["transmittance"], 0.0)
     return SegmentTransmission(transmittance, done["extra"])
 
 
 def visit_sheets(
-    rays: RayScene,
     inputs: Inputs,
     start: Callable[[], mit.Point3f],
     end: Callable[[], mit.Point3f],
@@ -116,7 +112,6 @@ def visit_sheets(
     cross the border of the loop.
 
     Args:
-        rays: ray scene.
         inputs: attached inputs.
         start: function that returns the points at one end.
         end: function that returns the points at the other end.
@@ -129,7 +124,7 @@ def visit_sheets(
         The carried arrays after the last sheet, and the mask of segments with more sheets than
         are followed.
     """
-    origin = dr.detach(start())
+    rays, origin = inputs.rays, dr.detach(start())
     offset = dr.detach(end()) - origin
     lanes, most = dr.width(active), opaque(_MAX_SHEETS)
 
@@ -191,7 +186,6 @@ class SegmentHit:
 
 
 def trace_to_surface(
-    rays: RayScene,
     inputs: Inputs,
     ray: mit.Ray3f,
     active: mit.Bool,
@@ -203,7 +197,6 @@ def trace_to_surface(
     """Trace rays to a surface, with a random decision at every sheet whether the ray ends there.
 
     Args:
-        rays: ray scene.
         inputs: detached inputs.
         ray: origins and unit directions.
         active: mask of active lanes.
@@ -212,7 +205,7 @@ def trace_to_surface(
         stratified_bits: decisions at the first sheets, one bit each, instead of random numbers:
             the transmitted rays are then spread as evenly as all rays.
     """
-    one = mi.Float(1.0)
+    rays, one = inputs.rays, mi.Float(1.0)
     hit = rays.find_nearest(ray, active, coherent=coherent)
     if not inputs.surfaces.has_sheets:
         face = dr.select(hit.valid, hit.point.face, rays.fallback_face)
