@@ -206,13 +206,14 @@ def sample_illumination_boundaries(
         samples: number of points on edges, for each transmitter.
         seed: random seed of the points.
     """
-    found: list[IlluminationBoundarySamples] = []
+    topology, found = surfaces.topology, list[IlluminationBoundarySamples]()
     for number, source in enumerate(tx):
         casts = _casting_edges(surfaces, None if depth else source, powers)
-        edges = _sample_edges(surfaces, casts, samples, seed, number)
-        if not len(edges.fraction):
+        start, end = surfaces.exact_vertices[topology.edges[casts]].unbind(1)
+        row, *place = sample_along_curves((end - start).norm(dim=1), samples, seed, number)
+        if not len(row):
             continue
-        ends = surfaces.exact_vertices[edges.ends].unbind(1)
+        edges, ends = _EdgeSamples(topology.edges[casts[row]], *place), (start[row], end[row])
         y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
         paths = find_paths_along(surfaces, sequences, source[None], y + surfaces.origin)
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
@@ -257,16 +258,6 @@ def _casting_edges(
             | (is_there & powers.transmit[faces]).any(1)
         )
     return torch.nonzero(casts)[:, 0]
-
-
-def _sample_edges(
-    surfaces: CandidateSurfaces, edge: Tensor, samples: int, seed: int, number: int
-) -> _EdgeSamples:
-    """Sample points evenly on edges."""
-    ends = surfaces.topology.edges[edge]
-    start, end = surfaces.exact_vertices[ends].unbind(1)
-    row, *sample = sample_along_curves((end - start).norm(dim=1), samples, seed, number)
-    return _EdgeSamples(ends[row], *sample)
 
 
 def sample_along_curves(

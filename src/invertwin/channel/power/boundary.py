@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 
@@ -18,6 +18,7 @@ from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.interior_silhouettes import InteriorSilhouetteSampler
+from invertwin.channel.power.intersection_curves import IntersectionCurveSampler
 from invertwin.channel.power.random_walk import PathState, RandomWalk
 from invertwin.channel.power.silhouettes import SilhouetteSample, SilhouetteSampler, shadow_speed
 from invertwin.channel.rays.arrays import opaque, to_index
@@ -29,17 +30,9 @@ from invertwin.channel.sampling import Sampling
 _SECOND_PART_OFFSET = 1 << 30  # added to indices, so that both parts have their own random numbers
 
 
+_Sampler = SilhouetteSampler | InteriorSilhouetteSampler | IntersectionCurveSampler
 _PathBuilder = Callable[..., Iterator[intersection_curves.PathParts]]
 """Function of attached inputs, a walker, sampled points and the depth."""
-
-
-@runtime_checkable
-class _Sampler(Protocol):
-    """Sampler of points of boundary paths."""
-
-    size: int
-
-    def draw(self, index: mit.UInt32) -> silhouettes.SampleBatch[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -132,9 +125,7 @@ class BoundarySamples:
             inside = InteriorSilhouetteSampler(inputs, share, seed + 2, resting=resting)
             found.append((inside, _interior_silhouette_paths))
         if curves is not None and meet:
-            contacts = intersection_curves.IntersectionCurveSampler(
-                inputs, curves, share, depth, seed
-            )
+            contacts = IntersectionCurveSampler(inputs, curves, share, depth, seed)
             found.append((contacts, intersection_curves.intersection_curve_paths))
         self._samplers, self._path_builders = zip(*found, strict=True)
         self._chunks = chunks

@@ -403,11 +403,6 @@ class PathRecords:
         rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
         return PathRecords(lanes, depth, state["frame"], dr.zeros(mi.UInt32, lanes), rows, length)
 
-    @property
-    def columns(self) -> list[mit.UInt32 | mit.Float | mit.Vector4f]:
-        """All arrays."""
-        return [self.frame, self.count, self.rows, self.length]
-
     def read_vertex(self, number: mit.UInt32, active: mit.Bool | bool = True) -> PathVertex:
         """Read one vertex of every path.
 

@@ -123,7 +123,7 @@ class PowerTracer:
             found = self._walk_paths(index, out, record=record)
             if record:
                 records = found
-                dr.schedule(*records.columns)
+                dr.schedule(records)
             dr.eval(out.values)
         return records
 

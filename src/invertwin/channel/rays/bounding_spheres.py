@@ -70,13 +70,12 @@ class BoundingSpheres:
         rows = np.full((int(groups.sum()) * self.group_size, 4), _EMPTY_SPHERE)
         rows[indices] = np.column_stack([centres - origin.numpy(), margin * radii])[order]
         self.table = to_float(torch.from_numpy(rows))
-        of_object = np.empty_like(order)
-        of_object[order] = indices // self.group_size
         self.group_count = len(rows) // self.group_size  # of all scenes
-        self._group = to_index(torch.from_numpy(of_object))
         index = np.empty_like(order)
         index[order] = indices
         self._table_indices = to_index(torch.from_numpy(index))
+        of_object = index // self.group_size
+        self._group = to_index(torch.from_numpy(of_object))
         self._owner = geometry.topology.device_face_object
         self._size = opaque(self.group_size)
         self._scenes: dict[str, mit.UInt32] | None = None
