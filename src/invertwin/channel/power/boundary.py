@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from invertwin.channel.power import integrand, intersection_curves, silhouettes
+from invertwin.channel.power import integrand, intersection_curves
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import PathContribution
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
@@ -127,31 +127,30 @@ class BoundarySamples:
         if curves is not None and meet:
             contacts = IntersectionCurveSampler(inputs, curves, share, depth, seed)
             found.append((contacts, intersection_curves.intersection_curve_paths))
-        self._samplers, self._path_builders = zip(*found, strict=True)
-        self._chunks = chunks
+        self._families, self._chunks = found, chunks
         self._prefetched = [
-            list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s in self._samplers
+            list(map(s.draw, itertools.islice(chunks(s.size), 1))) for s, _ in self._families
         ]
-        for family in self._prefetched:
-            for drawn in family:
-                drawn.launch()
+        for drawn in itertools.chain(*self._prefetched):
+            drawn.launch()
 
-    def iterate_families(self) -> list[Iterator[tuple[_PathBuilder, Any]]]:
-        """Iterate over each family: the function that builds paths, and a chunk of points."""
-        ahead, self._prefetched = self._prefetched, [[] for _ in self._samplers]
-        first = [[drawn.compress() for drawn in family] for family in ahead]
-        # Each sampler is bound here: a generator expression would draw all of them from the last.
-        later = [
-            map(
-                silhouettes.SampleBatch.compress,
-                map(s.draw, itertools.islice(self._chunks(s.size), len(now), None)),
-            )
-            for s, now in zip(self._samplers, first, strict=True)
-        ]
-        return [
-            zip(itertools.repeat(kind), itertools.chain(*family))
-            for kind, *family in zip(self._path_builders, first, later, strict=True)
-        ]
+    def iterate_points(self) -> Iterator[tuple[_PathBuilder, Any]]:
+        """Iterate over chunks of points, each with the function that builds its paths.
+
+        The first chunk of each family is compressed now.
+        """
+        first = [[drawn.compress() for drawn in family] for family in self._prefetched]
+        self._prefetched = [[] for _ in first]
+
+        def points() -> Iterator[tuple[_PathBuilder, Any]]:
+            for (sampler, builder), ready in zip(self._families, first, strict=True):
+                later = itertools.islice(self._chunks(sampler.size), len(ready), None)
+                while ready:
+                    yield builder, ready.pop()
+                for index in later:
+                    yield builder, sampler.draw(index).compress()
+
+        return points()
 
 
 def trace_boundary_paths(
@@ -167,12 +166,12 @@ def trace_boundary_paths(
         walker: random walk that extends the paths.
         samples: points on edges and intersection curves.
     """
-    families = samples.iterate_families()
+    points = samples.iterate_points()
 
     def segments() -> Iterator[BoundaryPaths]:
-        for kind, found in itertools.chain(*families):
+        for build, found in points:
             if found.size:
-                parts = kind(inputs, walker, found, samples.depth)
+                parts = build(inputs, walker, found, samples.depth)
                 yield from itertools.starmap(BoundaryPaths, parts)
 
     return segments()
