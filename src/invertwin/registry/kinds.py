@@ -30,7 +30,7 @@ from typing import (
 )
 
 from annotated_types import Len, MinLen
-from pydantic import Discriminator, GetCoreSchemaHandler, Tag, create_model, model_validator
+from pydantic import Discriminator, Field, GetCoreSchemaHandler, Tag, create_model, model_validator
 
 from invertwin.constants import read_table
 from invertwin.errors import InputError
@@ -278,10 +278,8 @@ class Registry:
         kind, base = self._kinds(group)[name], base or found.base
         fields: dict[str, Any] = {}
         if not kind.untagged:
-            fields[found.tag] = (
-                Literal[name],
-                section.key("", name if name == found.default else ...),
-            )
+            default = name if name == found.default else ...
+            fields[found.tag] = Literal[name], Field(default, description="")
         title = f"{name}_{base.__name__ if base is not ConstructorTable else group}"
         given = _camel_case(title), base, fields, kind.without
         return self.constructor_table(kind.make, *given, checked=kind.checked)
@@ -311,7 +309,7 @@ class Registry:
             return make
         plain = isinstance(make, type) and not is_dataclass(make)
         hints = get_type_hints(make.__init__ if plain else make, include_extras=True)
-        documents = _argument_docs(make)
+        documents = {**_ARGUMENT_DOCS, **section.argument_docs(make)}
         made: dict[str, Any] = dict(fields or {})
         arguments: dict[str, tuple[str | None, Any]] = {}
         product = make if isinstance(make, type) else hints.get("return")
@@ -347,14 +345,15 @@ class Registry:
         kind = self.run_file_type(hint, name)
         words = words.replace("[rad]", "[°]") if _is_angle(hint) else words
         if default is inspect.Parameter.empty:
-            return kind, section.key(words)
+            return kind, Field(description=words)
         if not isinstance(default, _PLAIN_TYPES):
-            return _union_type([kind, None]), section.key(words, None)
+            return _union_type([kind, None]), Field(None, description=words)
         if isinstance(default, float) and _is_angle(hint):
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _allowed_letters(hint):
             default = [*default]  # type: ignore[misc]
-        return kind, section.key(words, default, validate_default=isinstance(default, str))
+        checked = isinstance(default, str)
+        return kind, Field(default, description=words, validate_default=checked)
 
     def run_file_type(self, hint: Any, name: str) -> Any:
         """Return the type of an argument in run files.
@@ -546,22 +545,6 @@ def _to_radians(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _to_radians(item) for name, item in value.items()}
     return [_to_radians(item) for item in value] if isinstance(value, list) else math.radians(value)
-
-
-def _argument_docs(make: Any) -> dict[str, str]:
-    """Return the descriptions in `Attributes:` and `Args:` by name, bases first."""
-    found: dict[str, str] = {}
-    owners = reversed(make.__mro__[:-1]) if isinstance(make, type) else [make]
-    for owner in owners:
-        texts = [owner.__doc__, owner.__init__.__doc__ if isinstance(make, type) else None]
-        for text in map(inspect.cleandoc, filter(None, texts)):
-            for part in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", text, re.M):
-                for names, words in re.findall(
-                    r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", part, re.M
-                ):
-                    for name in names.split(", "):
-                        found.setdefault(name, " ".join(words.split()).removesuffix("."))
-    return {**_ARGUMENT_DOCS, **found}
 
 
 def _camel_case(name: str) -> str:

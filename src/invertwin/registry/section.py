@@ -4,9 +4,12 @@ Nothing here imports torch, so that the command line can say what it offers with
 """
 
 import difflib
+import inspect
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args
 
@@ -16,7 +19,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Discriminator,
-    Field,
     ValidationError,
     model_validator,
 )
@@ -85,19 +87,11 @@ def prefix_errors(path: str) -> Iterator[None]:
         raise KeyInputError(f"{path}.{error.at}" if error.at else path, str(error)) from None
 
 
-def key(description: str, default: Any = ..., **limits: Any) -> Any:
-    """A key of a table.
-
-    Args:
-        description: Meaning of the key.
-        default: Its default; without one it is required.
-        limits: Limits of its value, as pydantic's ``Field`` takes them.
-    """
-    return Field(default, description=description, **limits)
-
-
 class Section(BaseModel):
-    """A table of the run file; keys it does not know are errors that name the nearest match."""
+    """A table of the run file; keys it does not know are errors that name the nearest match.
+
+    Its keys are described in the docstring, under `Attributes:`.
+    """
 
     # Which kinds there are is known once all modules are imported, so validators are built late.
     model_config = ConfigDict(
@@ -127,6 +121,39 @@ class Section(BaseModel):
                     continue
                 found.append(_to_init_error(row))
         raise ValidationError.from_exception_data(cls.__name__, found)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """Describe the table and its keys as the docstring does."""
+        found = handler(core_schema)
+        table, texts = handler.resolve_ref_schema(found), argument_docs(cls)
+        if "description" in table:
+            table["description"] = table["description"].partition("\n\nAttributes:")[0]
+        for name, value in table.get("properties", {}).items():
+            if name in texts:
+                value.setdefault("description", texts[name])
+        return found
+
+
+@cache
+def argument_docs(make: Any) -> dict[str, str]:
+    """Read the descriptions in `Attributes:` and `Args:` by name, bases first.
+
+    Args:
+        make: A class or a function.
+    """
+    found: dict[str, str] = {}
+    owners = reversed(make.__mro__[:-1]) if isinstance(make, type) else [make]
+    for owner in owners:
+        texts = [owner.__doc__, owner.__init__.__doc__ if isinstance(make, type) else None]
+        for text in map(inspect.cleandoc, filter(None, texts)):
+            for part in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", text, re.M):
+                for names, words in re.findall(
+                    r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", part, re.M
+                ):
+                    for name in names.split(", "):
+                        found.setdefault(name, " ".join(words.split()).removesuffix("."))
+    return found
 
 
 def _to_init_error(row: ErrorDetails) -> InitErrorDetails:

@@ -10,7 +10,6 @@ from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Un
 from invertwin.limits import Count
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry
 from invertwin.registry.section import PrintableText, Section, raise_key_error
-from invertwin.registry.section import key as described
 
 _DATASET_SECTIONS = ("task", "frame", "seed", "dataset", "vary")  # of the data set itself
 _KeyPathText = Annotated[PrintableText, MinLen(1)]
@@ -18,28 +17,34 @@ _KeyPaths = FormOf((_KeyPathText, Annotated[list[_KeyPathText], MinLen(1)]))
 
 
 class DatasetTable(Section):
-    """A data set: many samples of the run file, each with other values."""
+    """A data set: many samples of the run file, each with other values.
 
-    samples: Count = described("how many")
-    shard: Count = described("samples of a shard, which is one tar file", 100)
-    signals: Annotated[list[Literal["raw", "map"]], MinLen(1)] = described(
-        "raw = beat signals of every channel; map = power over [grid], with [chirps] over range "
-        "rate, too",
-        ["map"],
-    )
-    classes: dict[str, PrintableText] = described(
-        "class of an object by its name; without it its name", {}
-    )
-    masks: bool = described("write how much of every triangle each radar position sees", False)
-    paths: bool = described("write the paths of every sample; not with [chirps]", False)
+    Attributes:
+        samples: how many
+        shard: samples of a shard, which is one tar file
+        signals: raw = beat signals of every channel; map = power over [grid], with [chirps] over
+            range rate, too
+        classes: class of an object by its name; without it its name
+        masks: write how much of every triangle each radar position sees
+        paths: write the paths of every sample; not with [chirps]
+    """
+
+    samples: Count
+    shard: Count = 100
+    signals: Annotated[list[Literal["raw", "map"]], MinLen(1)] = ["map"]
+    classes: dict[str, PrintableText] = {}
+    masks: bool = False
+    paths: bool = False
 
 
 class VaryTable(ConstructorTable):
-    """Values drawn anew for every sample."""
+    """Values drawn anew for every sample.
 
-    key: Annotated[Any, _KeyPaths] = described(
-        "its path in the run file, such as scene.box.position[0]; a list of paths gets one value"
-    )
+    Attributes:
+        key: its path in the run file, such as scene.box.position[0]; a list of paths gets one value
+    """
+
+    key: Annotated[Any, _KeyPaths]
 
     @property
     def paths(self) -> list[str]:

@@ -16,7 +16,7 @@ from invertwin.models.facets import FacetField, FacetMap
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar.surrogate.surrogate import Surrogate, resolve_surrogate
 from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry
-from invertwin.registry.section import key, raise_key_error
+from invertwin.registry.section import raise_key_error
 from invertwin.scene.scene import Object
 
 
@@ -25,9 +25,12 @@ class SurrogateTable(ConstructorTable):
 
     A name may stand for the table: surrogate = "exact", "response", "annealed", "gaussian" or
     "dirichlet", before the first table.
+
+    Attributes:
+        exact: fit exact signals instead; rough surfaces need boundary = false
     """
 
-    exact: bool = key("fit exact signals instead; rough surfaces need boundary = false", False)
+    exact: bool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -42,13 +45,17 @@ class SurrogateTable(ConstructorTable):
 
 
 class SearchTable(ConstructorTable):
-    """Poses in which an object may begin, beside its start; the best few are fitted."""
+    """Poses in which an object may begin, beside its start; the best few are fitted.
 
-    object: str = key("name in the scene")
-    fits: Count = key("number of best starts that are fitted", 4)
-    shortlist: bool = key(
-        "fit these in the first stage only; the best of them is fitted in all", False
-    )
+    Attributes:
+        object: name in the scene
+        fits: number of best starts that are fitted
+        shortlist: fit these in the first stage only; the best of them is fitted in all
+    """
+
+    object: str
+    fits: Count = 4
+    shortlist: bool = False
 
 
 def register(registry: Registry) -> None:

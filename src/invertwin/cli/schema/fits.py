@@ -14,26 +14,32 @@ from invertwin.inversion.schedule import Schedule
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import ConstructorTable, OneOf, TableOf, registry
-from invertwin.registry.section import Section, Seed, Vector, key
+from invertwin.registry.section import Section, Seed, Vector
 
 
 class _StartsTable(ConstructorTable):
-    """Random starting poses about the true pose of one object."""
+    """Random starting poses about the true pose of one object.
 
-    object: str = key("name in the scene")
-    joint_deg: NonNegative = key(
-        "turn of each free joint of a body, about a random axis among its own", 0.0
-    )
-    seed: Seed | None = key("without it the run's", None)
+    Attributes:
+        object: name in the scene
+        joint_deg: turn of each free joint of a body, about a random axis among its own
+        seed: without it the run's
+    """
+
+    object: str
+    joint_deg: NonNegative = 0.0
+    seed: Seed | None = None
 
 
 class _InitialTable(ConstructorTable):
-    """Initial pose of an object from conventional processing."""
+    """Initial pose of an object from conventional processing.
 
-    object: str | None = key(
-        "name in the scene; with [map] none: it is the first transmitter, at the centroid of power",
-        None,
-    )
+    Attributes:
+        object: name in the scene; with [map] none: it is the first transmitter, at the centroid of
+            power
+    """
+
+    object: str | None = None
 
 
 AnyStarts = Annotated[Any, TableOf(sample_nearby_poses, _StartsTable, ("generator",))]
@@ -54,27 +60,32 @@ class Budget(registry.constructor_table(Schedule, "Schedule", SamplingBase)):
 
 
 class ReconstructTable(Budget):
-    """The fit: its budget, and what counts as a success."""
+    """The fit: its budget, and what counts as a success.
 
-    parameters: list[str] = key("names of the parameters that are fitted; empty = all", [])
-    observations: list[str] = key("names of the sensors that are fitted; empty = all", [])
-    checkpoint_every: Count = key("steps from one checkpoint to the next", 10)
-    nuisances: list[Literal["range_bias", "clock_offset"]] = key(
-        "unknowns of the radar, fitted too", []
-    )
-    clutter: Literal["auto", "always", "never"] = key(
-        "echoes that the scene does not explain count as background, about which the best fit is "
-        "made again: auto = where the data are inconsistent with it; with the likelihood only",
-        "auto",
-    )
-    position_limit: Positive = key("m, largest error of a success", 0.03)
-    rotation_limit_deg: Positive = key("largest error of a success", 3.0)
-    axis: Vector | None = key(
-        "in the object's frame: success is judged by its origin and by this axis, turns about "
-        "which do not count",
-        None,
-    )
-    joint_limit_deg: Positive = key("largest mean error over the free joints of a body", 5.0)
+    Attributes:
+        parameters: names of the parameters that are fitted; empty = all
+        observations: names of the sensors that are fitted; empty = all
+        checkpoint_every: steps from one checkpoint to the next
+        nuisances: unknowns of the radar, fitted too
+        clutter: echoes that the scene does not explain count as background, about which the best
+            fit is made again: auto = where the data are inconsistent with it; with the likelihood
+            only
+        position_limit: m, largest error of a success
+        rotation_limit_deg: largest error of a success
+        axis: in the object's frame: success is judged by its origin and by this axis, turns about
+            which do not count
+        joint_limit_deg: largest mean error over the free joints of a body
+    """
+
+    parameters: list[str] = []
+    observations: list[str] = []
+    checkpoint_every: Count = 10
+    nuisances: list[Literal["range_bias", "clock_offset"]] = []
+    clutter: Literal["auto", "always", "never"] = "auto"
+    position_limit: Positive = 0.03
+    rotation_limit_deg: Positive = 3.0
+    axis: Vector | None = None
+    joint_limit_deg: Positive = 5.0
 
 
 def _validate_unchanged(value: Any, check: Callable[[Any], Any]) -> Any:
@@ -89,20 +100,23 @@ TomlTable = dict[str, Any]
 
 
 class RunOverrides(Section):
-    """A part of a run: its sections hold only what differs from the run."""
+    """A part of a run: its sections hold only what differs from the run.
 
-    reconstruct: Annotated[Budget, *_VALIDATE_AS_GIVEN] = key(
-        "what differs from [reconstruct]", None
-    )
-    optimizer: Annotated[Any, OneOf("optimizer"), *_KEEP_AS_GIVEN] = key(
-        "what differs from [optimizer]; another `kind` replaces it", None
-    )
-    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_KEEP_AS_GIVEN] = key(
-        "what differs from [surrogate], or a name that replaces it", None
-    )
-    model: TomlTable | None = key("what differs from [model]; another `kind` replaces it", None)
-    map: TomlTable | None = key("what differs from [map]", None)
-    placement: TomlTable | None = key("what differs from [placement]", None)
+    Attributes:
+        reconstruct: what differs from [reconstruct]
+        optimizer: what differs from [optimizer]; another `kind` replaces it
+        surrogate: what differs from [surrogate], or a name that replaces it
+        model: what differs from [model]; another `kind` replaces it
+        map: what differs from [map]
+        placement: what differs from [placement]
+    """
+
+    reconstruct: Annotated[Budget | None, *_VALIDATE_AS_GIVEN] = None
+    optimizer: Annotated[Any, OneOf("optimizer"), *_KEEP_AS_GIVEN] = None
+    surrogate: Annotated[Any, TableOf(Surrogate, SurrogateTable), *_KEEP_AS_GIVEN] = None
+    model: TomlTable | None = None
+    map: TomlTable | None = None
+    placement: TomlTable | None = None
 
     def overrides(self) -> dict[str, Any]:
         """Tables merged over the run; a part has no stages."""
@@ -111,32 +125,37 @@ class RunOverrides(Section):
 
 
 class StageTable(RunOverrides):
-    """A part of a fit, from where the one before has ended."""
+    """A part of a fit, from where the one before has ended.
 
-    parameters: list[str] = key(
-        "names of those that are free; the others keep their values; empty = all", []
-    )
-    rebuild: bool = key(
-        "new modules of these parameters start from the twin so far; the others are dropped", False
-    )
-    remesh: Positive | None = key(
-        "m, edge length of the new triangles of objects with free vertices; rebuilds them", None
-    )
+    Attributes:
+        parameters: names of those that are free; the others keep their values; empty = all
+        rebuild: new modules of these parameters start from the twin so far; the others are dropped
+        remesh: m, edge length of the new triangles of objects with free vertices; rebuilds them
+    """
+
+    parameters: list[str] = []
+    rebuild: bool = False
+    remesh: Positive | None = None
 
 
 class VariantTable(RunOverrides):
-    """The same data and starts, fitted in another way, to compare."""
+    """The same data and starts, fitted in another way, to compare.
 
-    reconstruct: Annotated[ReconstructTable, *_VALIDATE_AS_GIVEN] = key(  # type: ignore[override]
-        "what differs from [reconstruct]", None
-    )
-    loss: TomlTable | None = key("what differs from [loss]", None)
-    parameters: list[Annotated[Any, OneOf("parameter")]] | None = key(
-        "in place of [[parameters]]", None
-    )
-    search: TomlTable | None = key("what differs from [search]; another `kind` replaces it", None)
-    stages: list[StageTable] | None = key("in place of [[stages]]", None)
-    first_starts: Count | None = key("so many of the starts; without it all", None)
+    Attributes:
+        reconstruct: what differs from [reconstruct]
+        loss: what differs from [loss]
+        parameters: in place of [[parameters]]
+        search: what differs from [search]; another `kind` replaces it
+        stages: in place of [[stages]]
+        first_starts: so many of the starts; without it all
+    """
+
+    reconstruct: Annotated[ReconstructTable | None, *_VALIDATE_AS_GIVEN] = None  # type: ignore[override]
+    loss: TomlTable | None = None
+    parameters: list[Annotated[Any, OneOf("parameter")]] | None = None
+    search: TomlTable | None = None
+    stages: list[StageTable] | None = None
+    first_starts: Count | None = None
 
     def overrides(self) -> dict[str, Any]:
         """Tables merged over the run."""
@@ -153,37 +172,62 @@ class VariantTable(RunOverrides):
 
 
 class CalibrationTable(RunOverrides):
-    """Range bias and clock offset from one object whose place is known, before the fit."""
+    """Range bias and clock offset from one object whose place is known, before the fit.
 
-    object: str = key("name of the known object")
-    method: Literal["fit", "backprojection"] = key(
-        "fit the two numbers, or focus the object best", "fit"
-    )
+    Attributes:
+        object: name of the known object
+        method: fit the two numbers, or focus the object best
+    """
+
+    object: str
+    method: Literal["fit", "backprojection"] = "fit"
 
 
 class MeasuresTable(Section):
-    """Measures of shape error against the truth, in numbers and pictures."""
+    """Measures of shape error against the truth, in numbers and pictures.
 
-    object: str = key("name in the scene")
-    thresholds: Annotated[list[Positive], MinLen(1)] = key("m, thresholds of the F-score", [0.02])
-    voxel: Positive = key("m, edge of voxels for the shared volume", 0.02)
-    seen: bool = key("score only what some radar position sees; both are written", False)
-    every: Count = key("steps between two points of the curve", 10)
+    Attributes:
+        object: name in the scene
+        thresholds: m, thresholds of the F-score
+        voxel: m, edge of voxels for the shared volume
+        seen: score only what some radar position sees; both are written
+        every: steps between two points of the curve
+    """
+
+    object: str
+    thresholds: Annotated[list[Positive], MinLen(1)] = [0.02]
+    voxel: Positive = 0.02
+    seen: bool = False
+    every: Count = 10
 
 
 class PlanTable(Section):
-    """Settings of a plan: comparisons and candidate positions."""
+    """Settings of a plan: comparisons and candidate positions.
 
-    fits: Annotated[int, Ge(0)] = key("simulated fits whose spread it is compared with", 0)
-    candidates: Annotated[Any, OneOf("track")] | None = key("m, positions that may be added", None)
+    Attributes:
+        fits: simulated fits whose spread it is compared with
+        candidates: m, positions that may be added
+    """
+
+    fits: Annotated[int, Ge(0)] = 0
+    candidates: Annotated[Any, OneOf("track")] | None = None
 
 
 class LandscapeTable(Section):
-    """Losses along a line through the truth: exact signal beside surrogate."""
+    """Losses along a line through the truth: exact signal beside surrogate.
 
-    object: str = key("name in the scene")
-    axis: Vector = key("direction of the line")
-    span: Positive = key("m on either side, surrogate", 0.4)
-    points: Annotated[int, Ge(3)] = key("points on the line, surrogate", 41)
-    exact_span: Positive = key("m on either side, exact signal", 0.01)
-    exact_points: Annotated[int, Ge(3)] = key("points on the line, exact signal", 201)
+    Attributes:
+        object: name in the scene
+        axis: direction of the line
+        span: m on either side, surrogate
+        points: points on the line, surrogate
+        exact_span: m on either side, exact signal
+        exact_points: points on the line, exact signal
+    """
+
+    object: str
+    axis: Vector
+    span: Positive = 0.4
+    points: Annotated[int, Ge(3)] = 41
+    exact_span: Positive = 0.01
+    exact_points: Annotated[int, Ge(3)] = 201

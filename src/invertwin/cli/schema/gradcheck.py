@@ -9,7 +9,7 @@ from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
 from invertwin.inversion.gradcheck.tangents import GaussianBump
 from invertwin.limits import Count, Positive
 from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list, registry
-from invertwin.registry.section import Depth, check_presence, key, raise_key_error
+from invertwin.registry.section import Depth, check_presence, raise_key_error
 
 
 class _ParameterRate:
@@ -24,20 +24,25 @@ class _ParameterRate:
 class GradcheckTable(ConstructorTable):
     """Derivative of the map against central differences: `GradcheckSettings`, and what is
     checked.
+
+    Attributes:
+        parameter: what changes with θ, as in [[parameters]]; θ = 0 is its start
+        tangent: how fast its values change with θ, by name: a number for all entries, a list, or a
+            bump over the nodes of a grid
+        step: step of θ in the differences
+        step_deg: the same where θ turns something
+        depth: most bounces of a path
+        samples: rays of one derivative
+        boundary_samples: silhouette samples of one derivative
     """
 
-    parameter: Annotated[Any, OneOf("parameter", ConstructorTable)] = key(
-        "what changes with θ, as in [[parameters]]; θ = 0 is its start"
-    )
-    tangent: dict[str, Annotated[Any, _ParameterRate]] = key(
-        "how fast its values change with θ, by name: a number for all entries, a list, or a bump "
-        "over the nodes of a grid"
-    )
-    step: Positive | None = key("step of θ in the differences", None)
-    step_deg: Positive | None = key("the same where θ turns something", None)
-    depth: Depth = key("most bounces of a path", 3)
-    samples: Count = key("rays of one derivative", 4_000_000)
-    boundary_samples: Count = key("silhouette samples of one derivative", 1_000_000)
+    parameter: Annotated[Any, OneOf("parameter", ConstructorTable)]
+    tangent: dict[str, Annotated[Any, _ParameterRate]]
+    step: Positive | None = None
+    step_deg: Positive | None = None
+    depth: Depth = 3
+    samples: Count = 4_000_000
+    boundary_samples: Count = 1_000_000
 
     @property
     def acts_on(self) -> Literal["scene", "sensor"]:

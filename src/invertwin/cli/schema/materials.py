@@ -12,18 +12,21 @@ from pydantic import model_validator
 from invertwin import scene
 from invertwin.errors import InputError
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, ValueFormat
-from invertwin.registry.section import InputPath, Section, key, raise_key_error
+from invertwin.registry.section import InputPath, Section, raise_key_error
 from invertwin.scene.material.materials import Medium
 from invertwin.scene.material.values import RANGES, Value
 from invertwin.storage.untrusted import read_npy
 
 
 class TextureFile(Section):
-    """Values from an image, laid over the object as seen along its own x axis, its z axis up."""
+    """Values from an image, laid over the object as seen along its own x axis, its z axis up.
 
-    image: InputPath = key(
-        "NumPy file (.npy) of rows of pixels, top row first, read at the middle of each triangle"
-    )
+    Attributes:
+        image: NumPy file (.npy) of rows of pixels, top row first, read at the middle of each
+            triangle
+    """
+
+    image: InputPath
 
 
 def _value_type(name: str, angle: bool) -> Any:
@@ -38,10 +41,14 @@ def _value_type(name: str, angle: bool) -> Any:
 
 
 class MediumTable(ConstructorTable):
-    """A dielectric, by numbers or from the ITU table."""
+    """A dielectric, by numbers or from the ITU table.
+
+    Attributes:
+        itu: name in the table of ITU-R P.2040
+    """
 
     optional: ClassVar = ("permittivity", "conductivity")
-    itu: Annotated[str, MinLen(1)] | None = key("name in the table of ITU-R P.2040", None)
+    itu: Annotated[str, MinLen(1)] | None = None
 
     @model_validator(mode="after")
     def _require_permittivity(self) -> "MediumTable":

@@ -15,7 +15,7 @@ from invertwin.links.metasurface.coverage import Coverage
 from invertwin.links.metasurface.panel import Metasurface
 from invertwin.links.metasurface.wall_path import PanelPlacement, WallPath
 from invertwin.registry.kinds import OneOf, Registry
-from invertwin.registry.section import Section, Seed, Vector, key, prefix_errors
+from invertwin.registry.section import Section, Seed, Vector, prefix_errors
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 
@@ -28,60 +28,97 @@ _AIMED = 0.25  # share of the receivers, the worst ones, on whose middle the pan
 
 
 class Receivers(Section):
-    """Receivers at random in a box."""
+    """Receivers at random in a box.
 
-    low: Vector = key("m, a corner of the box")
-    high: Vector = key("m, the opposite corner")
-    count: CountOfTwo = key("those that the search sees", 4800)
-    batch: CountOfTwo = key("of them, in one evaluation", 1200)
-    scored: CountOfTwo = key("others, of another seed, that score what was found", 4000)
+    Attributes:
+        low: m, a corner of the box
+        high: m, the opposite corner
+        count: those that the search sees
+        batch: of them, in one evaluation
+        scored: others, of another seed, that score what was found
+    """
+
+    low: Vector
+    high: Vector
+    count: CountOfTwo = 4800
+    batch: CountOfTwo = 1200
+    scored: CountOfTwo = 4000
 
 
 class Walls(Section):
-    """Places of the panel: a level path along walls, the room on its left."""
+    """Places of the panel: a level path along walls, the room on its left.
 
-    corners: Annotated[list[_POINT], MinLen(2)] = key("m, x and y, off the walls by half a panel")
-    height: float = key("m, z of the panel's centre")
-    radius: Positive = key("m, of round corners", 0.2)
-    closed: bool = key("whether the last corner leads back to the first", False)
+    Attributes:
+        corners: m, x and y, off the walls by half a panel
+        height: m, z of the panel's centre
+        radius: m, of round corners
+        closed: whether the last corner leads back to the first
+    """
+
+    corners: Annotated[list[_POINT], MinLen(2)]
+    height: float
+    radius: Positive = 0.2
+    closed: bool = False
 
 
 class Panel(Section):
-    """The metasurface."""
+    """The metasurface.
 
-    counts: Annotated[list[Count], Len(2, 2)] = key("elements across and up")
-    spacing: Positive = key("m, of the elements")
-    bits: Count | None = key("phases are rounded to 2^bits values; without it they are not", None)
-    pattern: Annotated[Any, OneOf("pattern")] | None = key(
-        "of an element; without it that of an aperture", None
-    )
+    Attributes:
+        counts: elements across and up
+        spacing: m, of the elements
+        bits: phases are rounded to 2^bits values; without it they are not
+        pattern: of an element; without it that of an aperture
+    """
+
+    counts: Annotated[list[Count], Len(2, 2)]
+    spacing: Positive
+    bits: Count | None = None
+    pattern: Annotated[Any, OneOf("pattern")] | None = None
 
 
 class Placement(Section):
-    """A metasurface is placed so that the worst receivers of a room get most."""
+    """A metasurface is placed so that the worst receivers of a room get most.
 
-    frequency: Positive = key("Hz")
-    transmitter: Vector = key("m")
-    receivers: Receivers = key("who should be reached")
-    walls: Walls = key("where the panel may stand")
-    panel: Panel = key("the metasurface")
-    share: Annotated[float, Gt(0), Lt(1)] = key("of the receivers, that count as the worst", 0.1)
-    target: Vector | None = key("m, the focus; without it the middle of the worst quarter", None)
-    along: float = key("m on the path, where fits start that have no [search]", 0.0)
-    yaw_deg: float = key("away from the wall's normal, where they start", 0.0)
-    spread_start_deg: _POINT = key(
-        "half widths of the beam, across and up, where they start", [0.0, 0.0]
-    )
-    yaw_limit_deg: NonNegative = key("largest turn away from the wall's normal", 25.0)
-    spread_limit_deg: NonNegative = key("largest half width of the beam", 30.0)
-    depth: Annotated[int, Ge(0)] = key("most surfaces that a path without the panel meets", 1)
-    edges: Annotated[int, Ge(0)] = key("most edges that a path without the panel goes round", 1)
-    edge_width: NonNegative = key(
-        "m, added to the width of shadows; it falls to none over reconstruct.annealing", 0.3
-    )
-    softness: Positive = key("dB, width of the quantile; it falls to a tenth alike", 3.0)
-    starts: Count = key("fits, which differ by the random numbers of [search]", 1)
-    seed: Seed | None = key("of the receivers; without it the run's", None)
+    Attributes:
+        frequency: Hz
+        transmitter: m
+        receivers: who should be reached
+        walls: where the panel may stand
+        panel: the metasurface
+        share: of the receivers, that count as the worst
+        target: m, the focus; without it the middle of the worst quarter
+        along: m on the path, where fits start that have no [search]
+        yaw_deg: away from the wall's normal, where they start
+        spread_start_deg: half widths of the beam, across and up, where they start
+        yaw_limit_deg: largest turn away from the wall's normal
+        spread_limit_deg: largest half width of the beam
+        depth: most surfaces that a path without the panel meets
+        edges: most edges that a path without the panel goes round
+        edge_width: m, added to the width of shadows; it falls to none over reconstruct.annealing
+        softness: dB, width of the quantile; it falls to a tenth alike
+        starts: fits, which differ by the random numbers of [search]
+        seed: of the receivers; without it the run's
+    """
+
+    frequency: Positive
+    transmitter: Vector
+    receivers: Receivers
+    walls: Walls
+    panel: Panel
+    share: Annotated[float, Gt(0), Lt(1)] = 0.1
+    target: Vector | None = None
+    along: float = 0.0
+    yaw_deg: float = 0.0
+    spread_start_deg: _POINT = [0.0, 0.0]
+    yaw_limit_deg: NonNegative = 25.0
+    spread_limit_deg: NonNegative = 30.0
+    depth: Annotated[int, Ge(0)] = 1
+    edges: Annotated[int, Ge(0)] = 1
+    edge_width: NonNegative = 0.3
+    softness: Positive = 3.0
+    starts: Count = 1
+    seed: Seed | None = None
 
     @property
     def initial(self) -> Trial:
@@ -148,19 +185,26 @@ class Placement(Section):
 
 
 class _PanelSearch(Section):
-    """Placements in which the metasurface of [placement] may begin; the best few are fitted."""
+    """Placements in which the metasurface of [placement] may begin; the best few are fitted.
 
-    fits: Count = key("of the best starts, of different parts of the path", 6)
-    shortlist: bool = key(
-        "fit these in the first stage only; the best of them is fitted in all", True
-    )
+    Attributes:
+        fits: of the best starts, of different parts of the path
+        shortlist: fit these in the first stage only; the best of them is fitted in all
+    """
+
+    fits: Count = 6
+    shortlist: bool = True
 
 
 class RandomPanels(_PanelSearch):
-    """Random placements, each from a slice of its own of every range."""
+    """Random placements, each from a slice of its own of every range.
+
+    Attributes:
+        count: placements that are compared
+    """
 
     kind: Literal["panels"]
-    count: Count = key("placements that are compared", 32)
+    count: Count = 32
 
     def trials(self, table: Placement, generator: torch.Generator) -> list[Trial]:
         """The placements.
@@ -181,14 +225,18 @@ class RandomPanels(_PanelSearch):
 
 
 class PanelGrid(_PanelSearch):
-    """Placements on a grid; positions run slowest."""
+    """Placements on a grid; positions run slowest.
+
+    Attributes:
+        places: on the path
+        yaws: between the limits
+        spread_deg: half widths of the beam, of which every pair is tried
+    """
 
     kind: Literal["panel_grid"]
-    places: CountOfTwo = key("on the path", 80)
-    yaws: Count = key("between the limits", 5)
-    spread_deg: Annotated[list[NonNegative], MinLen(1)] = key(
-        "half widths of the beam, of which every pair is tried", [5.0, 15.0]
-    )
+    places: CountOfTwo = 80
+    yaws: Count = 5
+    spread_deg: Annotated[list[NonNegative], MinLen(1)] = [5.0, 15.0]
 
     def trials(self, table: Placement, generator: torch.Generator) -> list[Trial]:
         """The placements.

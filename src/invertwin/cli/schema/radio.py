@@ -13,7 +13,7 @@ from invertwin.limits import Count, NonNegative
 from invertwin.links import AntennaMount, PropagationSettings, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
-from invertwin.registry.section import Section, Seed, Vector, key, prefix_errors
+from invertwin.registry.section import Section, Seed, Vector, prefix_errors
 from invertwin.scene import AntennaArray, Mesh, Scene
 from invertwin.scene.shape_models.distance import signed_distance
 
@@ -21,17 +21,18 @@ _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
 
 
 class AntennaTable(Section):
-    """An antenna of one element."""
+    """An antenna of one element.
 
-    pattern: Annotated[Any, OneOf("pattern")] | None = key("without it isotropic", None)
-    polarisation: PolarisationValue = key(
-        '"V", "H", "circular" (right-hand) or two numbers (V, H)', "V"
-    )
-    orientation: Orientation | None = key(
-        "look_at or rotation_deg of its axes (x ahead, y left, z up); without it they are the "
-        "world's",
-        None,
-    )
+    Attributes:
+        pattern: without it isotropic
+        polarisation: "V", "H", "circular" (right-hand) or two numbers (V, H)
+        orientation: look_at or rotation_deg of its axes (x ahead, y left, z up); without it they
+            are the world's
+    """
+
+    pattern: Annotated[Any, OneOf("pattern")] | None = None
+    polarisation: PolarisationValue = "V"
+    orientation: Orientation | None = None
 
     def build_mount(self, positions: Tensor) -> AntennaMount:
         """The antenna at places.
@@ -48,12 +49,15 @@ class AntennaTable(Section):
 
 
 class TransmitterTable(AntennaTable):
-    """Transmitters: one or several, all with the same antenna."""
+    """Transmitters: one or several, all with the same antenna.
 
-    positions: Annotated[list[Vector], MinLen(1)] = key(
-        "m, of each; where a fit of it starts, unless [transmitter_starts] says otherwise"
-    )
-    power_dbm: float = key("sent by each [dBm]", 0.0)
+    Attributes:
+        positions: m, of each; where a fit of it starts, unless [transmitter_starts] says otherwise
+        power_dbm: sent by each [dBm]
+    """
+
+    positions: Annotated[list[Vector], MinLen(1)]
+    power_dbm: float = 0.0
 
     def build(self) -> Transmitters:
         """The transmitters."""
@@ -73,12 +77,15 @@ class RoughPathsTable(SamplingBase):
 class MapTable(
     registry.constructor_table(RadioMap, "RadioMap", PropagationBase, without=("propagation",))
 ):
-    """Gain from the transmitters to receivers at known positions."""
+    """Gain from the transmitters to receivers at known positions.
 
-    antenna: AntennaTable = key("antenna of every receiver", AntennaTable())
-    rough: RoughPathsTable | None = key(
-        "paths that rough surfaces scatter, whose power is added; without it left out", None
-    )
+    Attributes:
+        antenna: antenna of every receiver
+        rough: paths that rough surfaces scatter, whose power is added; without it left out
+    """
+
+    antenna: AntennaTable = AntennaTable()
+    rough: RoughPathsTable | None = None
 
     def build(self, given: Any = None, /, **more: Any) -> RadioMap:
         """The forward model."""
@@ -92,13 +99,21 @@ class MapTable(
 
 
 class TransmitterStartsTable(Section):
-    """Random places of the first transmitter in a box, outside of solid objects."""
+    """Random places of the first transmitter in a box, outside of solid objects.
 
-    low: Vector = key("corner of the box [m]")
-    high: Vector = key("the opposite corner [m]")
-    count: Count = key("fits", 10)
-    clear: NonNegative = key("least distance to all surfaces [m]", 0.1)
-    seed: Seed | None = key("without it the run's", None)
+    Attributes:
+        low: corner of the box [m]
+        high: the opposite corner [m]
+        count: fits
+        clear: least distance to all surfaces [m]
+        seed: without it the run's
+    """
+
+    low: Vector
+    high: Vector
+    count: Count = 10
+    clear: NonNegative = 0.1
+    seed: Seed | None = None
 
     def sample_positions(self, scene: Scene, seed: int) -> Tensor:
         """Sample start positions of fits [start, 3].

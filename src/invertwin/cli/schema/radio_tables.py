@@ -12,34 +12,45 @@ from torch import Tensor
 from invertwin import links
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.registry.kinds import KindGroup, Registry
-from invertwin.registry.section import InputPath, Section, Seed, Vector, key, prefix_errors
+from invertwin.registry.section import InputPath, Section, Seed, Vector, prefix_errors
 from invertwin.scene import load_mesh
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
 
 class ReceivedData(Section):
-    """Simulated levels of receivers in the true scene, with errors; keys that differ from [map]."""
+    """Simulated levels of receivers in the true scene, with errors; keys that differ from [map].
+
+    Attributes:
+        positions: m, where the transmitters really are; without it those of [transmitter]
+        noise: standard deviation of the errors, in the unit of the map
+        bandwidth: without it that of [map]
+        depth: without it that of [map]
+        edges: without it that of [map]
+        rays: without it those of [map]
+        seed: seed of errors and rays; without it the run's
+    """
 
     kind: Literal["received"]
-    positions: Annotated[list[Vector], MinLen(1)] | None = key(
-        "m, where the transmitters really are; without it those of [transmitter]", None
-    )
-    noise: NonNegative = key("standard deviation of the errors, in the unit of the map", 0.0)
-    bandwidth: NonNegative | None = key("without it that of [map]", None)
-    depth: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
-    edges: Annotated[int, Ge(0)] | None = key("without it that of [map]", None)
-    rays: Count | None = key("without it those of [map]", None)
-    seed: Seed | None = key("seed of errors and rays; without it the run's", None)
+    positions: Annotated[list[Vector], MinLen(1)] | None = None
+    noise: NonNegative = 0.0
+    bandwidth: NonNegative | None = None
+    depth: Annotated[int, Ge(0)] | None = None
+    edges: Annotated[int, Ge(0)] | None = None
+    rays: Count | None = None
+    seed: Seed | None = None
 
 
 class ReceivedFile(Section):
     """Measured levels: rows of x, y, z and one level for each transmitter, with one header line.
 
     The places of the rows stand in for those of [map].
+
+    Attributes:
+        file: CSV: x,y,z [m], then the levels
     """
 
     kind: Literal["received_file"]
-    file: InputPath = key("CSV: x,y,z [m], then the levels")
+    file: InputPath
 
     def read(self) -> tuple[links.ReceiverPoints, Tensor]:
         """Read receiver positions, and levels [tx, position].

@@ -19,27 +19,36 @@ from invertwin.registry.section import (
     InputPath,
     Section,
     Seed,
-    key,
     prefix_errors,
     raise_key_error,
 )
 
 
 class SimulatedData(Section):
-    """Exact signals of the true scene, with noise."""
+    """Exact signals of the true scene, with noise.
+
+    Attributes:
+        points_per_m2: rough points per m²: a number, or a table by object, "*" for all others
+        samples: coherent paths
+        depth: most bounces of a path; with [chirps] one, unless it has mirrors
+        mirrors: names of smooth flat objects that show the rest again (ghosts)
+        rough_paths: paths to draw of two bounces, and of each larger number
+        snr_db: signal-to-noise ratio per sample; without it no noise
+        noise_figure_db: thermal noise of a receiver instead of snr_db
+        seed: without it the run's
+        every_start: a recording of its own for every start: coverage of error bars
+    """
 
     kind: Literal["simulated"]
-    points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))] = key(
-        'rough points per m²: a number, or a table by object, "*" for all others'
-    )
-    samples: Count = key("coherent paths", 200_000)
-    depth: Depth = key("most bounces of a path; with [chirps] one, unless it has mirrors", 3)
-    mirrors: list[str] = key("names of smooth flat objects that show the rest again (ghosts)", [])
-    rough_paths: Count = key("paths to draw of two bounces, and of each larger number", 200_000)
-    snr_db: Decibels | None = key("signal-to-noise ratio per sample; without it no noise", None)
-    noise_figure_db: Decibels | None = key("thermal noise of a receiver instead of snr_db", None)
-    seed: Seed | None = key("without it the run's", None)
-    every_start: bool = key("a recording of its own for every start: coverage of error bars", False)
+    points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))]
+    samples: Count = 200_000
+    depth: Depth = 3
+    mirrors: list[str] = []
+    rough_paths: Count = 200_000
+    snr_db: Decibels | None = None
+    noise_figure_db: Decibels | None = None
+    seed: Seed | None = None
+    every_start: bool = False
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
@@ -49,11 +58,13 @@ class SimulatedData(Section):
 
 
 class RecordingTable(ConstructorTable):
-    """Measured data."""
+    """Measured data.
 
-    channels: InputPath | None = key(
-        "channel calibration that `invertwin look --reflector` wrote; divided out", None
-    )
+    Attributes:
+        channels: channel calibration that `invertwin look --reflector` wrote; divided out
+    """
+
+    channels: InputPath | None = None
 
     def build(self, given: Any = None, /, **more: Any) -> Capture | ChirpCapture:
         """The recording with its channels calibrated."""
@@ -65,14 +76,15 @@ class RecordingTable(ConstructorTable):
 
 
 class ChirpRecordingTable(RecordingTable, RadarPoseTable):
-    """Raw chirps of a board, made one signal per frame."""
+    """Raw chirps of a board, made one signal per frame.
 
-    chirp: Annotated[int, Ge(0)] | None = key(
-        "number of one chirp, from 0; default: mean over the frame, in which targets fade", None
-    )
-    frame: Annotated[int, Ge(0)] | None = key(
-        "number of the only frame to use, from 0; default: all", None
-    )
+    Attributes:
+        chirp: number of one chirp, from 0; default: mean over the frame, in which targets fade
+        frame: number of the only frame to use, from 0; default: all
+    """
+
+    chirp: Annotated[int, Ge(0)] | None = None
+    frame: Annotated[int, Ge(0)] | None = None
 
     def build(self, given: Any = None, /, **more: Any) -> ChirpCapture:
         """The recording with its poses."""

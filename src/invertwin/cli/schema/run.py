@@ -6,7 +6,7 @@ from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import create_model, model_validator
+from pydantic import Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
@@ -34,7 +34,6 @@ from invertwin.registry.section import (
     Section,
     Seed,
     Vector,
-    key,
     raise_key_error,
     require_section,
 )
@@ -63,131 +62,177 @@ AnyRcs = Annotated[Any, TableOf(rcs, RcsTable, _RCS_GIVEN, checked=False)]
 
 
 class SceneFileTable(Section):
-    """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file."""
+    """Objects from the geometry of a Mitsuba or Sionna scene file (XML), named as in the file.
 
-    file: InputPath = key("path, from the run file's folder")
-    materials: dict[str, AnyMaterial] = key("materials by the file's material ids", {})
-    material: AnyMaterial | None = key("material of all other objects; without it concrete", None)
+    Attributes:
+        file: path, from the run file's folder
+        materials: materials by the file's material ids
+        material: material of all other objects; without it concrete
+    """
+
+    file: InputPath
+    materials: dict[str, AnyMaterial] = {}
+    material: AnyMaterial | None = None
 
 
 class TruthTable(Section):
-    """True values of an object: they replace those of its scene table, key by key."""
+    """True values of an object: they replace those of its scene table, key by key.
 
-    position: Vector | None = key("m", None)
-    rotation_deg: Vector | None = key("rotation vector", None)
-    scale: Positive | None = key("factor", None)
-    material: AnyMaterial | None = key("what it is really made of", None)
-    velocity: Vector | None = key("m/s", None)
-    angles_deg: dict[str, Vector] | None = key(
-        "joint angles of a body: all that are not at rest", None
-    )
-    parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)] | None = key(
-        "its real shape, in place of the scene's and in the same frame", None
-    )
+    Attributes:
+        position: m
+        rotation_deg: rotation vector
+        scale: factor
+        material: what it is really made of
+        velocity: m/s
+        angles_deg: joint angles of a body: all that are not at rest
+        parts: its real shape, in place of the scene's and in the same frame
+    """
+
+    position: Vector | None = None
+    rotation_deg: Vector | None = None
+    scale: Positive | None = None
+    material: AnyMaterial | None = None
+    velocity: Vector | None = None
+    angles_deg: dict[str, Vector] | None = None
+    parts: Annotated[list[Annotated[Any, OneOf("shape")]], MinLen(1)] | None = None
 
 
 class RawTable(Section):
-    """Raw files as other tools read them: DCA1000 samples, SDK and mmWave Studio settings."""
+    """Raw files as other tools read them: DCA1000 samples, SDK and mmWave Studio settings.
 
-    lanes: Literal[2, 4] = key("LVDS lanes: 4 for xWR12xx and xWR14xx, 2 for later ones", 2)
-    real: bool = key("real samples instead of I and Q", False)
-    bits: Literal[12, 14, 16] = key("bits of the ADC", 16)
-    full_scale: Positive | None = key(
-        "√(received over sent power) of the largest count; without it 1.25 times the largest "
-        "sample",
-        None,
-    )
-    adc_start_time: NonNegative = key(
-        "s, from the start of the ramp to the first sample; the waveform is what is sampled; 0 = "
-        "up to 6 µs of the idle time",
-        0.0,
-    )
-    frame_period: Positive | None = key(
-        "s, from frame to frame; without it the shortest that holds the chirps", None
-    )
+    Attributes:
+        lanes: LVDS lanes: 4 for xWR12xx and xWR14xx, 2 for later ones
+        real: real samples instead of I and Q
+        bits: bits of the ADC
+        full_scale: √(received over sent power) of the largest count; without it 1.25 times the
+            largest sample
+        adc_start_time: s, from the start of the ramp to the first sample; the waveform is what is
+            sampled; 0 = up to 6 µs of the idle time
+        frame_period: s, from frame to frame; without it the shortest that holds the chirps
+    """
+
+    lanes: Literal[2, 4] = 2
+    real: bool = False
+    bits: Literal[12, 14, 16] = 16
+    full_scale: Positive | None = None
+    adc_start_time: NonNegative = 0.0
+    frame_period: Positive | None = None
 
 
 class ObservationTable(Section):
-    """Data of one of several sensors; a missing key falls back to the section of its name."""
+    """Data of one of several sensors; a missing key falls back to the section of its name.
 
-    radar: AnyRadar | None = key("what measures; not with a capture", None)
-    grid: AnyGrid | None = key("the map that is compared", None)
-    data: AnyData | None = key("what is fitted", None)
-    surrogate: AnySurrogate | None = key("kernels of the smooth model", None)
-    chirps: AnyChirps | None = key("several ramps a frame", None)
-    model: AnyModel | None = key("a forward model in place of the surrogate's", None)
-    weight: Positive = key("weight of its loss in the mean", 1.0)
+    Attributes:
+        radar: what measures; not with a capture
+        grid: the map that is compared
+        data: what is fitted
+        surrogate: kernels of the smooth model
+        chirps: several ramps a frame
+        model: a forward model in place of the surrogate's
+        weight: weight of its loss in the mean
+    """
+
+    radar: AnyRadar | None = None
+    grid: AnyGrid | None = None
+    data: AnyData | None = None
+    surrogate: AnySurrogate | None = None
+    chirps: AnyChirps | None = None
+    model: AnyModel | None = None
+    weight: Positive = 1.0
 
 
 class _RunFile(Section):
-    """A whole run file; which sections a command needs is checked by the command."""
+    """A whole run file; which sections a command needs is checked by the command.
 
-    task: Annotated[str, NameOf("task")] = key("what the file is for")
-    frame: Literal[2] = key("axes: 2 = x ahead, y to the left, z up")
-    title: PrintableText = key("heading of the report", "")
-    note: str = key("shown in the report", "")
-    seed: Seed = key("seed of all random numbers", 0)
-    scene: dict[str, Annotated[Any, OneOf("object")]] = key("[scene.<name>]: an object each", {})
-    scene_file: SceneFileTable | None = key("objects from a file", None)
-    room: AnyRoom | None = key("a furnished room: floor, ceiling, walls, furniture", None)
-    truth: dict[str, TruthTable] = key("[truth.<name>]: where an object really is", {})
-    radar: AnyRadar | None = key("what measures; not with a capture", None)
-    grid: AnyGrid | None = key("the map that is compared", None)
-    chirps: AnyChirps | None = key("several ramps a frame", None)
-    impairments: AnyImpairments | None = key("what the front end of simulated data adds", None)
-    raw: RawTable | None = key("raw files that simulate writes beside the capture", None)
-    data: AnyData | None = key("what is fitted", None)
-    transmitter: TransmitterTable | None = key("what sends, with [map]", None)
-    map: AnyMap | None = key("what receivers at known places get of [transmitter]", None)
-    camera: AnyCamera | None = key("what sees [image]", None)
-    image: AnyImage | None = key("what [camera] shows; with [gradcheck] it is differentiated", None)
-    transmitter_starts: TransmitterStartsTable | None = key(
-        "where fits of the first transmitter start; without it where [transmitter] says", None
-    )
-    observations: dict[str, ObservationTable] = key(
-        "[observations.<name>]: several sensors, each with its own data", {}
-    )
-    parameters: list[Annotated[Any, OneOf("parameter")]] = key(
-        "[[parameters]]: what is unknown", []
-    )
-    starts: fits.AnyStarts | None = key("where fits start; without it where the scene says", None)
-    search: Annotated[Any, OneOf("search")] | None = key(
-        "several poses to begin from at every start; the best end counts", None
-    )
-    plan: fits.PlanTable | None = key("what `invertwin plan` compares and tries", None)
-    twin: TwinTable | None = key("the ground that `invertwin twin` searches", None)
-    initial: fits.AnyInitial | None = key(
-        "where the fit starts by conventional processing, not with [starts]", None
-    )
-    surrogate: AnySurrogate = key("kernels of the smooth model", {}, validate_default=True)
-    model: AnyModel | None = key("a forward model in place of the surrogate's", None)
-    loss: Annotated[Any, OneOf("loss")] | None = key(
-        "how maps are compared; without it likelihood; of received levels mse as they are, of "
-        "movers correlation",
-        None,
-    )
-    optimizer: Annotated[Any, OneOf("optimizer")] = key(
-        "how a gradient becomes a step", {}, validate_default=True
-    )
-    reconstruct: fits.ReconstructTable | None = key("the fit", None)
-    stages: list[fits.StageTable] = key(
-        "[[stages]]: parts of the fit, one after another; without them one", []
-    )
-    variants: dict[str, fits.VariantTable] = key(
-        "[variants.<name>]: other ways to fit, to compare", {}
-    )
-    measures: fits.MeasuresTable | None = key("scores of the found shape", None)
-    calibration: fits.CalibrationTable | None = key("calibration before the fit", None)
-    landscape: fits.LandscapeTable | None = key("losses along a line", None)
-    gradcheck: AnyGradcheck | None = key("the gradient check", None)
-    placement: Placement | None = key(
-        "a metasurface that is placed; with [gradcheck] what is differentiated", None
-    )
-    rcs: AnyRcs | None = key("the radar signature; with [gradcheck] what is differentiated", None)
-    dataset: DatasetTable | None = key("many samples of the run file", None)
-    vary: list[Annotated[Any, OneOf("distribution")]] = key(
-        "[[vary]]: what is drawn anew for every sample of [dataset]", []
-    )
+    Attributes:
+        task: what the file is for
+        frame: axes: 2 = x ahead, y to the left, z up
+        title: heading of the report
+        note: shown in the report
+        seed: seed of all random numbers
+        scene: [scene.<name>]: an object each
+        scene_file: objects from a file
+        room: a furnished room: floor, ceiling, walls, furniture
+        truth: [truth.<name>]: where an object really is
+        radar: what measures; not with a capture
+        grid: the map that is compared
+        chirps: several ramps a frame
+        impairments: what the front end of simulated data adds
+        raw: raw files that simulate writes beside the capture
+        data: what is fitted
+        transmitter: what sends, with [map]
+        map: what receivers at known places get of [transmitter]
+        camera: what sees [image]
+        image: what [camera] shows; with [gradcheck] it is differentiated
+        transmitter_starts: where fits of the first transmitter start; without it where
+            [transmitter] says
+        observations: [observations.<name>]: several sensors, each with its own data
+        parameters: [[parameters]]: what is unknown
+        starts: where fits start; without it where the scene says
+        search: several poses to begin from at every start; the best end counts
+        plan: what `invertwin plan` compares and tries
+        twin: the ground that `invertwin twin` searches
+        initial: where the fit starts by conventional processing, not with [starts]
+        surrogate: kernels of the smooth model
+        model: a forward model in place of the surrogate's
+        loss: how maps are compared; without it likelihood; of received levels mse as they are, of
+            movers correlation
+        optimizer: how a gradient becomes a step
+        reconstruct: the fit
+        stages: [[stages]]: parts of the fit, one after another; without them one
+        variants: [variants.<name>]: other ways to fit, to compare
+        measures: scores of the found shape
+        calibration: calibration before the fit
+        landscape: losses along a line
+        gradcheck: the gradient check
+        placement: a metasurface that is placed; with [gradcheck] what is differentiated
+        rcs: the radar signature; with [gradcheck] what is differentiated
+        dataset: many samples of the run file
+        vary: [[vary]]: what is drawn anew for every sample of [dataset]
+    """
+
+    task: Annotated[str, NameOf("task")]
+    frame: Literal[2]
+    title: PrintableText = ""
+    note: str = ""
+    seed: Seed = 0
+    scene: dict[str, Annotated[Any, OneOf("object")]] = {}
+    scene_file: SceneFileTable | None = None
+    room: AnyRoom | None = None
+    truth: dict[str, TruthTable] = {}
+    radar: AnyRadar | None = None
+    grid: AnyGrid | None = None
+    chirps: AnyChirps | None = None
+    impairments: AnyImpairments | None = None
+    raw: RawTable | None = None
+    data: AnyData | None = None
+    transmitter: TransmitterTable | None = None
+    map: AnyMap | None = None
+    camera: AnyCamera | None = None
+    image: AnyImage | None = None
+    transmitter_starts: TransmitterStartsTable | None = None
+    observations: dict[str, ObservationTable] = {}
+    parameters: list[Annotated[Any, OneOf("parameter")]] = []
+    starts: fits.AnyStarts | None = None
+    search: Annotated[Any, OneOf("search")] | None = None
+    plan: fits.PlanTable | None = None
+    twin: TwinTable | None = None
+    initial: fits.AnyInitial | None = None
+    surrogate: AnySurrogate = Field({}, validate_default=True)
+    model: AnyModel | None = None
+    loss: Annotated[Any, OneOf("loss")] | None = None
+    optimizer: Annotated[Any, OneOf("optimizer")] = Field({}, validate_default=True)
+    reconstruct: fits.ReconstructTable | None = None
+    stages: list[fits.StageTable] = []
+    variants: dict[str, fits.VariantTable] = {}
+    measures: fits.MeasuresTable | None = None
+    calibration: fits.CalibrationTable | None = None
+    landscape: fits.LandscapeTable | None = None
+    gradcheck: AnyGradcheck | None = None
+    placement: Placement | None = None
+    rcs: AnyRcs | None = None
+    dataset: DatasetTable | None = None
+    vary: list[Annotated[Any, OneOf("distribution")]] = []
 
     @model_validator(mode="after")
     def _check_sections(self, info: Any) -> "_RunFile":
@@ -406,7 +451,7 @@ def _add_plugin_sections() -> type[_RunFile]:
     if taken:
         raise InputError(f"expected new names of sections, got {taken[0]}; rename that plugin's")
     fields: dict[str, Any] = {
-        name: (table | None, key((table.__doc__ or "").split(".")[0], None))
+        name: (table | None, Field(None, description=(table.__doc__ or "").split(".")[0]))
         for name, table in tables.items()
     }
     return create_model("RunFile", __base__=_RunFile, __doc__=_RunFile.__doc__, **fields)

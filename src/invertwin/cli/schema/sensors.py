@@ -26,18 +26,22 @@ ElementNumbers = Annotated[list[Count], MinLen(1)]
 
 _NumberOrEach = Annotated[Any, FormOf((float, list[float]))]
 PolarisationValue = Annotated[Any, FormOf((Literal["V", "H", "circular"], list[_NumberOrEach]))]
-_POLARISATION_HELP = (
-    '"V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of each'
-)
-_LEAKAGE_HELP = "field of the orthogonal polarisation over that of the wanted one"
 
 
 class ArrayTable(ConstructorTable):
-    """Antenna elements in the radar frame (x boresight, y left, z up)."""
+    """Antenna elements in the radar frame (x boresight, y left, z up).
 
-    center: section.Vector = section.key("m, in the radar frame", [0.0, 0.0, 0.0])
-    polarisation: PolarisationValue = section.key(_POLARISATION_HELP, "V")
-    leakage: _NumberOrEach = section.key(_LEAKAGE_HELP + ", of all elements or of each", 0.0)
+    Attributes:
+        center: m, in the radar frame
+        polarisation: "V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of
+            each
+        leakage: field of the orthogonal polarisation over that of the wanted one, of all elements
+            or of each
+    """
+
+    center: section.Vector = [0.0, 0.0, 0.0]
+    polarisation: PolarisationValue = "V"
+    leakage: _NumberOrEach = 0.0
 
     def build(self, given: Any = None, /, **more: Any) -> scene.AntennaArray:
         """The elements about their centre."""
@@ -46,29 +50,28 @@ class ArrayTable(ConstructorTable):
 
 
 class BoardTable(ConstructorTable):
-    """Elements on a board's grid of half wavelengths."""
+    """Elements on a board's grid of half wavelengths.
 
-    elevation: Literal[-1, 1] | None = section.key(
-        "1 = rows grow upwards, -1 = downwards; required where there are several rows", None
-    )
-    azimuth: Literal[-1, 1] = section.key(
-        "1 = columns grow to the left of the radar (y), the right of who faces it, -1 = to its "
-        "right",
-        1,
-    )
-    transmitters: ElementNumbers | None = section.key(
-        "numbers from 1 in the order of sending; without it all, or those of the recording", None
-    )
-    receivers: ElementNumbers | None = section.key(
-        "numbers from 1, ascending; without it all, or those of the recording", None
-    )
-    pattern: Annotated[Any, OneOf("pattern")] | None = section.key(
-        "pattern of every element; else isotropic", None
-    )
-    polarisation: PolarisationValue | None = section.key(
-        _POLARISATION_HELP + "; without it the board's", None
-    )
-    leakage: float = section.key(_LEAKAGE_HELP, 0.0)
+    Attributes:
+        elevation: 1 = rows grow upwards, -1 = downwards; required where there are several rows
+        azimuth: 1 = columns grow to the left of the radar (y), the right of who faces it, -1 = to
+            its right
+        transmitters: numbers from 1 in the order of sending; without it all, or those of the
+            recording
+        receivers: numbers from 1, ascending; without it all, or those of the recording
+        pattern: pattern of every element; else isotropic
+        polarisation: "V", "H", "circular" (right-hand) or two numbers (V, H), of all elements or of
+            each; without it the board's
+        leakage: field of the orthogonal polarisation over that of the wanted one
+    """
+
+    elevation: Literal[-1, 1] | None = None
+    azimuth: Literal[-1, 1] = 1
+    transmitters: ElementNumbers | None = None
+    receivers: ElementNumbers | None = None
+    pattern: Annotated[Any, OneOf("pattern")] | None = None
+    polarisation: PolarisationValue | None = None
+    leakage: float = 0.0
 
     def build(self, given: Any = None, /, **more: Any) -> boards.Mounting:
         """The board as it is mounted."""
@@ -79,7 +82,13 @@ class BoardTable(ConstructorTable):
 
 
 class LookAtOrientation(section.Section):
-    look_at: section.Vector = section.key("m, the point that boresight is turned to")
+    """Boresight towards a point.
+
+    Attributes:
+        look_at: m, the point that boresight is turned to
+    """
+
+    look_at: section.Vector
 
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [place, 3, 3] at places [place, 3] [m]."""
@@ -88,7 +97,13 @@ class LookAtOrientation(section.Section):
 
 
 class RotatedOrientation(section.Section):
-    rotation_deg: section.Vector = section.key("rotation vector, the same at every position")
+    """The same axes at every position.
+
+    Attributes:
+        rotation_deg: rotation vector, the same at every position
+    """
+
+    rotation_deg: section.Vector
 
     def rotations(self, places: Tensor) -> Tensor:
         """Axes [3, 3], the same at all places."""
@@ -104,20 +119,19 @@ Orientation = Annotated[
 
 
 class RadarPoseTable(ConstructorTable):
-    """Pose of a radar in every frame."""
+    """Pose of a radar in every frame.
 
-    positions: TrackValue = section.key(
-        "m, one for each frame: a list of points or a track; for a recording also one for all",
-        [[0.0, 0.0, 0.0]],
-    )
-    orientation: Orientation = section.key(
-        "look_at or rotation_deg", RotatedOrientation(rotation_deg=[0.0, 0.0, 0.0])
-    )
-    range_center: section.Vector | None = section.key(
-        "m, a point in the world that has range 0 in every frame, as in data that are motion "
-        "compensated to a scene; without it ranges count from the radar",
-        None,
-    )
+    Attributes:
+        positions: m, one for each frame: a list of points or a track; for a recording also one for
+            all
+        orientation: look_at or rotation_deg
+        range_center: m, a point in the world that has range 0 in every frame, as in data that are
+            motion compensated to a scene; without it ranges count from the radar
+    """
+
+    positions: TrackValue = [[0.0, 0.0, 0.0]]
+    orientation: Orientation = RotatedOrientation(rotation_deg=[0.0, 0.0, 0.0])
+    range_center: section.Vector | None = None
 
     def poses(self, frames: int) -> tuple[Tensor, Tensor]:
         """Positions [frame, 3]; columns are the radar's boresight, left and up axes [frame, 3, 3].
@@ -144,13 +158,17 @@ class RadarPoseTable(ConstructorTable):
 
 
 class RadarTable(RadarPoseTable):
-    """Arrays, waveform and poses; one frame per position."""
+    """Arrays, waveform and poses; one frame per position.
 
-    board: Annotated[Any, OneOf("board")] | None = section.key(
-        "antenna elements of a board, or:", None
-    )
-    transmitters: Annotated[Any, OneOf("array")] | None = section.key("antenna elements", None)
-    receivers: Annotated[Any, OneOf("array")] | None = section.key("antenna elements", None)
+    Attributes:
+        board: antenna elements of a board, or:
+        transmitters: antenna elements
+        receivers: antenna elements
+    """
+
+    board: Annotated[Any, OneOf("board")] | None = None
+    transmitters: Annotated[Any, OneOf("array")] | None = None
+    receivers: Annotated[Any, OneOf("array")] | None = None
 
     @model_validator(mode="after")
     def _check_elements(self) -> "RadarTable":
@@ -171,19 +189,19 @@ class RadarTable(RadarPoseTable):
 
 
 class ChirpsTable(ConstructorTable):
-    """Several ramps a frame: objects move between them, and range rates are resolved."""
+    """Several ramps a frame: objects move between them, and range rates are resolved.
 
-    count: Annotated[int, Ge(2)] = section.key("ramps of each transmitter in a frame (loops)")
-    retrace: bool = section.key(
-        "trace rays anew at every ramp, instead of moving what is seen at the start of the frame; "
-        "always where something has a motion",
-        False,
-    )
-    visibility_every: Count = section.key(
-        "with `retrace` or a motion: loops for which one trace serves; points follow their "
-        "surfaces meanwhile",
-        1,
-    )
+    Attributes:
+        count: ramps of each transmitter in a frame (loops)
+        retrace: trace rays anew at every ramp, instead of moving what is seen at the start of the
+            frame; always where something has a motion
+        visibility_every: with `retrace` or a motion: loops for which one trace serves; points
+            follow their surfaces meanwhile
+    """
+
+    count: Annotated[int, Ge(2)]
+    retrace: bool = False
+    visibility_every: Count = 1
 
 
 AnyRadar = Annotated[

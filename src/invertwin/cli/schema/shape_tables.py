@@ -18,7 +18,7 @@ from invertwin.links.metasurface.wall_path import PanelPlacement
 from invertwin.radar.parameters import RadarPose, RadarTrajectory
 from invertwin.radar.radar import Radar
 from invertwin.registry.kinds import ConstructorTable, KindGroup, OneOf, Registry
-from invertwin.registry.section import Counts, InputPath, Vector, key, prefix_errors
+from invertwin.registry.section import Counts, InputPath, Vector, prefix_errors
 from invertwin.scene.files import load_mesh
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 from invertwin.scene.people.body import BodyTemplate
@@ -26,11 +26,17 @@ from invertwin.scene.people.body_models import body, body_template
 
 
 class ShapePoseTable(ConstructorTable):
-    """Pose of a shape: scaled, then rotated about its own origin, then moved."""
+    """Pose of a shape: scaled, then rotated about its own origin, then moved.
 
-    position: Vector = key("m", [0.0, 0.0, 0.0])
-    rotation_deg: Vector = key("rotation vector", [0.0, 0.0, 0.0])
-    scale: Positive = key("factor", 1.0)
+    Attributes:
+        position: m
+        rotation_deg: rotation vector
+        scale: factor
+    """
+
+    position: Vector = [0.0, 0.0, 0.0]
+    rotation_deg: Vector = [0.0, 0.0, 0.0]
+    scale: Positive = 1.0
 
     def build_mesh(self) -> scenes.Mesh:
         """Build the mesh in its own frame, scaled but not placed."""
@@ -51,12 +57,20 @@ class ShapePoseTable(ConstructorTable):
 
 
 class _ObjectProperties(ConstructorTable):
-    material: Annotated[Any, OneOf("material")] = key("what it is made of")
-    velocity: Vector | None = key("m/s", None)
+    """Material and motion of an object.
+
+    Attributes:
+        material: what it is made of
+        velocity: m/s
+        motion: what it does from the start of the frame on, one after the other; needs [chirps]
+    """
+
+    material: Annotated[Any, OneOf("material")]
+    velocity: Vector | None = None
     motion: Annotated[
         list[Annotated[Any, OneOf("motion")]],
         BeforeValidator(lambda given: [given] if isinstance(given, dict) else given),
-    ] = key("what it does from the start of the frame on, one after the other; needs [chirps]", [])
+    ] = []
 
 
 class ObjectTable(ShapePoseTable, _ObjectProperties):
@@ -73,11 +87,13 @@ class ObjectTable(ShapePoseTable, _ObjectProperties):
 
 
 class RoomTable(ConstructorTable):
-    """A furnished room, whose objects stand beside those of `[scene.<name>]`."""
+    """A furnished room, whose objects stand beside those of `[scene.<name>]`.
 
-    materials: dict[str, Annotated[Any, OneOf("material")]] = key(
-        "materials by the room's objects, in place of their own", {}
-    )
+    Attributes:
+        materials: materials by the room's objects, in place of their own
+    """
+
+    materials: dict[str, Annotated[Any, OneOf("material")]] = {}
 
     def build(self, given: Any = None, /, **more: Any) -> dict[str, scenes.Object]:
         """Its objects by name.
@@ -95,16 +111,25 @@ class RoomTable(ConstructorTable):
 
 
 class ParameterTable(ConstructorTable):
-    """Keys common to all parameters."""
+    """Keys common to all parameters.
 
-    name: str | None = key("by which stages and variants call it; without it its kind", None)
-    rate: Positive | None = key("its own learning rate; without it the optimizer's", None)
+    Attributes:
+        name: by which stages and variants call it; without it its kind
+        rate: its own learning rate; without it the optimizer's
+    """
+
+    name: str | None = None
+    rate: Positive | None = None
 
 
 class LatentTable(ConstructorTable):
-    """Coordinates in standard deviations."""
+    """Coordinates in standard deviations.
 
-    weight: NonNegative = key("weight of ½ Σ z²", 0.0)
+    Attributes:
+        weight: weight of ½ Σ z²
+    """
+
+    weight: NonNegative = 0.0
 
 
 class LearnedTable(LatentTable):
@@ -115,15 +140,23 @@ class MovingTargetParameter(ParameterTable):
     """Place, size, velocity, turn and diffuse share of a rough body in motion.
 
     Starts at the strongest echo that moves, with the object's size; the data must have chirps.
+
+    Attributes:
+        object: name in the scene
+        cells: range and Doppler cells to either side of the echo that are fitted
+        free: what is fitted; the rest keeps the scene's values, and a spin that is held is none
     """
 
     kind: Literal["mover"]
-    object: str = key("name in the scene")
-    cells: Count = key("range and Doppler cells to either side of the echo that are fitted", 6)
-    free: list[Literal["place", "velocity", "spin", "size", "diffuse"]] = key(
-        "what is fitted; the rest keeps the scene's values, and a spin that is held is none",
-        ["place", "velocity", "spin", "size", "diffuse"],
-    )
+    object: str
+    cells: Count = 6
+    free: list[Literal["place", "velocity", "spin", "size", "diffuse"]] = [
+        "place",
+        "velocity",
+        "spin",
+        "size",
+        "diffuse",
+    ]
 
 
 class PanelPhases(ParameterTable):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from invertwin.limits import CountOfTwo, Positive
 from invertwin.registry.kinds import ConstructorTable, FormOf, OneOf
-from invertwin.registry.section import InputPath, Section, key, prefix_errors, raise_key_error
+from invertwin.registry.section import InputPath, Section, prefix_errors, raise_key_error
 from invertwin.signatures import Signature, aspect_directions
 
 POLARISATION_LETTERS = {"V": "VH", "H": "HV", "circular": "RL"}
@@ -17,11 +17,17 @@ POLARISATION_LETTERS = {"V": "VH", "H": "HV", "circular": "RL"}
 
 
 class SweepTable(Section):
-    """Evenly spaced numbers."""
+    """Evenly spaced numbers.
 
-    start: float = key("first")
-    stop: float = key("last")
-    count: CountOfTwo = key("how many, both ends with them")
+    Attributes:
+        start: first
+        stop: last
+        count: how many, both ends with them
+    """
+
+    start: float
+    stop: float
+    count: CountOfTwo
 
 
 SweptValues = Annotated[Any, FormOf((float, Annotated[list[float], MinLen(1)], SweepTable))]
@@ -42,55 +48,81 @@ def expand_values(value: Any) -> Tensor:
 
 
 class ReceiverDirection(Section):
-    """Direction of a bistatic receiver."""
+    """Direction of a bistatic receiver.
 
-    theta_deg: SweptValues = key("angle to z, one for all or one for each aspect")
-    phi_deg: SweptValues = key("angle from x towards y")
+    Attributes:
+        theta_deg: angle to z, one for all or one for each aspect
+        phi_deg: angle from x towards y
+    """
+
+    theta_deg: SweptValues
+    phi_deg: SweptValues
 
 
 class RcsCase(Section):
-    """Radar cross-section that is known from another source."""
+    """Radar cross-section that is known from another source.
 
-    reference: Annotated[Any, OneOf("cross_section")] = key("what it should be")
-    channel: Literal["VV", "HH", "VH", "HV", "RR", "LL", "RL", "LR"] = key(
-        "received and sent polarisation"
-    )
-    part: str | None = key('such as "order 3"; without it the whole field', None)
-    statistic: Literal["max", "rms"] = key(
-        "of the dB errors over all frequencies and aspects", "max"
-    )
+    Attributes:
+        reference: what it should be
+        channel: received and sent polarisation
+        part: such as "order 3"; without it the whole field
+        statistic: of the dB errors over all frequencies and aspects
+    """
+
+    reference: Annotated[Any, OneOf("cross_section")]
+    channel: Literal["VV", "HH", "VH", "HV", "RR", "LL", "RL", "LR"]
+    part: str | None = None
+    statistic: Literal["max", "rms"] = "max"
 
 
 class RcsMeasurement(Section):
-    """A measured radar cross-section; rows of the swept angles and frequencies are compared."""
+    """A measured radar cross-section; rows of the swept angles and frequencies are compared.
 
-    file: InputPath = key("rows of frequency [Hz], θ [°], φ [°], RCS [dBsm]")
-    channel: Literal["VV", "HH", "VH", "HV"] = key("received and sent polarisation")
+    Attributes:
+        file: rows of frequency [Hz], θ [°], φ [°], RCS [dBsm]
+        channel: received and sent polarisation
+    """
+
+    file: InputPath
+    channel: Literal["VV", "HH", "VH", "HV"]
 
 
 class RcsImageTable(Section):
-    """A focused image of the sweep."""
+    """A focused image of the sweep.
 
-    extent: Positive = key("m, half its side")
-    pixels: CountOfTwo = key("along each side", 128)
+    Attributes:
+        extent: m, half its side
+        pixels: along each side
+    """
+
+    extent: Positive
+    pixels: CountOfTwo = 128
 
 
 class RcsTable(ConstructorTable):
-    """The radar cross-section of the scene, far away: the arguments of `invertwin.rcs`."""
+    """The radar cross-section of the scene, far away: the arguments of `invertwin.rcs`.
 
-    frequencies: SweptValues = key("Hz: one, a list, or start, stop and count")
-    theta_deg: SweptValues = key(
-        "angle from z to the radar: one for all aspects, or one for each", 90.0
-    )
-    phi_deg: SweptValues = key("angle from x towards y: one for all aspects, or one for each", 0.0)
-    receiver: ReceiverDirection | None = key("without it the transmitter receives", None)
-    polarisation: Literal["V", "H", "circular"] = key(
-        "sent; V and H lie along θ and φ about `up`, circular is right-hand", "V"
-    )
-    cases: dict[str, RcsCase] = key("[rcs.cases.<name>]: what results are compared with", {})
-    measured: list[RcsMeasurement] = key("[[rcs.measured]]: measurements to compare with", [])
-    profile: bool = key("draw range profiles; needs evenly spaced frequencies", False)
-    image: RcsImageTable | None = key("draw an image in the plane of the sweep", None)
+    Attributes:
+        frequencies: Hz: one, a list, or start, stop and count
+        theta_deg: angle from z to the radar: one for all aspects, or one for each
+        phi_deg: angle from x towards y: one for all aspects, or one for each
+        receiver: without it the transmitter receives
+        polarisation: sent; V and H lie along θ and φ about `up`, circular is right-hand
+        cases: [rcs.cases.<name>]: what results are compared with
+        measured: [[rcs.measured]]: measurements to compare with
+        profile: draw range profiles; needs evenly spaced frequencies
+        image: draw an image in the plane of the sweep
+    """
+
+    frequencies: SweptValues
+    theta_deg: SweptValues = 90.0
+    phi_deg: SweptValues = 0.0
+    receiver: ReceiverDirection | None = None
+    polarisation: Literal["V", "H", "circular"] = "V"
+    cases: dict[str, RcsCase] = {}
+    measured: list[RcsMeasurement] = []
+    profile: bool = False
+    image: RcsImageTable | None = None
 
     def build(self, given: Any = None, /, **more: Any) -> Signature:
         """The signature of a scene."""
