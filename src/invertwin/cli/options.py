@@ -5,12 +5,15 @@ import os
 import shlex
 import sys
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 from rich.console import Console
+
+from invertwin.registry.section import argument_docs
 
 
 class _TolerantOutput:
@@ -73,106 +76,103 @@ BackendOption = Annotated[
         show_default=False,
     ),
 ]
+EngineOption = Annotated[
+    Literal["processes", "ray"],
+    option("--engine", "Processes of this machine, or tasks of a Ray cluster."),
+]
+SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1)]
 FileArgument = Annotated[Path, argument("Run file (TOML).")]
 FilesArgument = Annotated[list[Path], argument("Run files (TOML).")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions:
-    """Output folder of a command."""
+    """Output folder of a command.
 
-    out: Annotated[
-        Path | None, option("-o", "--out", "Folder for the results; default: out/<file stem>.")
-    ] = None
-    overwrite: Annotated[bool, option("--overwrite", "Replace the results in the folder.")] = False
+    Attributes:
+        out: Folder for the results; default: out/<file stem>.
+        overwrite: Replace the results in the folder.
+    """
+
+    out: Annotated[Path | None, typer.Option("-o", "--out")] = None
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OutputOptions):
-    """Options common to commands with run files."""
+    """Options common to commands with run files.
 
-    seed: Annotated[
-        int | None, option("--seed", "Replaces the run file's seed.", min=0, max=2**31 - 1)
-    ] = None
+    Attributes:
+        seed: Replaces the run file's seed.
+    """
+
+    seed: SeedOption = None
     backend: BackendOption = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResumableOptions(RunOptions):
-    """Options of commands that resume interrupted work."""
+    """Options of commands that resume interrupted work.
 
-    resume: Annotated[bool, option("--resume", "Go on with an interrupted run in the folder.")] = (
-        False
-    )
+    Attributes:
+        resume: Go on with an interrupted run in the folder.
+    """
 
-
-EngineOption = Annotated[
-    Literal["processes", "ray"],
-    option("--engine", "Processes of this machine, or tasks of a Ray cluster."),
-]
+    resume: Annotated[bool, typer.Option("--resume")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetOptions(ResumableOptions):
-    """Engine and workers of a data set, and the part to simulate."""
+    """Engine and workers of a data set, and the part to simulate.
 
-    workers: Annotated[
-        int | None,
-        option("--workers", "Processes of one thread; default: as many as cores.", min=1),
-    ] = None
-    shard: Annotated[str | None, option("--shard", "i/n: part i of n, in a folder of its own.")] = (
-        None
-    )
+    Attributes:
+        workers: Processes of one thread; default: as many as cores.
+        shard: i/n: part i of n, in a folder of its own.
+    """
+
+    workers: Annotated[int | None, typer.Option(min=1)] = None
+    shard: str | None = None
     engine: EngineOption = "processes"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(ResumableOptions):
-    """Engine and workers of the fits of a run."""
+    """Engine and workers of the fits of a run.
 
-    workers: Annotated[
-        int | None,
-        option(
-            "--workers",
-            "Processes of one thread that fit starts and variants beside each other; "
-            "default: here, one after another.",
-            min=1,
-        ),
-    ] = None
+    Attributes:
+        workers: Processes of one thread that fit starts and variants beside each other; default:
+            here, one after another.
+        view: Show the fits in a browser while they go on.
+    """
+
+    workers: Annotated[int | None, typer.Option(min=1)] = None
     engine: EngineOption = "processes"
-    view: Annotated[bool, option("--view", "Show the fits in a browser while they go on.")] = False
+    view: Annotated[bool, typer.Option("--view")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(OutputOptions):
-    """Recording and the options of its reader."""
+    """Recording and the options of its reader.
 
-    recording: Annotated[
-        Path,
-        argument(
-            "Raw .bin or .setup.json, a .toml description of arrays or sweeps, an .s1p or "
-            ".s2p sweep, or a .nc capture."
-        ),
-    ]
-    config: Annotated[
-        Path | None, option("--config", "-c", "Settings of a .bin: .cfg or .mmwave.json.")
-    ] = None
-    board: Annotated[str | None, option("--board", "-b", "Its preset, such as xWR1843.")] = None
-    elevation: Annotated[
-        int | None, option("1: rows of the board grow upwards, -1: downwards.")
-    ] = None
-    azimuth: Annotated[
-        int | None, option("1: columns grow to the radar's left (y), -1: right.")
-    ] = None
-    lanes: Annotated[int | None, option("2 or 4 LVDS lanes, where the settings do not say.")] = None
-    change: Annotated[
-        list[str] | None,
-        option(
-            "--set",
-            "Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers, "
-            "transmitters, loops, frames.",
-        ),
-    ] = None
+    Attributes:
+        recording: Raw .bin or .setup.json, a .toml description of arrays or sweeps, an .s1p or .s2p
+            sweep, or a .nc capture.
+        config: Settings of a .bin: .cfg or .mmwave.json.
+        board: Its preset, such as xWR1843.
+        elevation: 1: rows of the board grow upwards, -1: downwards.
+        azimuth: 1: columns grow to the radar's left (y), -1: right.
+        lanes: 2 or 4 LVDS lanes, where the settings do not say.
+        change: Corrects a setting of a .bin, such as samples=128; also lanes, real, receivers,
+            transmitters, loops, frames.
+    """
+
+    recording: Annotated[Path, typer.Argument(show_default=False)]
+    config: Annotated[Path | None, typer.Option("--config", "-c")] = None
+    board: Annotated[str | None, typer.Option("--board", "-b")] = None
+    elevation: int | None = None
+    azimuth: int | None = None
+    lanes: int | None = None
+    change: Annotated[list[str] | None, typer.Option("--set")] = None
 
     def command(self, name: str, folder: Path) -> str:
         """The command line that does the same from another folder.
@@ -186,7 +186,7 @@ class RecordingOptions(OutputOptions):
             value = getattr(self, field.name)
             if field.name in ("out", "overwrite", "backend") or value in (field.default, None):
                 continue
-            kind = hints[field.name].__metadata__[0]
+            kind = next(iter(getattr(hints[field.name], "__metadata__", ())), typer.Option())
             # Typer's first argument is a name, too, within an annotation.
             names = (str(kind.default), *(kind.param_decls or ()))
             flags = [name for name in names if name.startswith("--")]
@@ -202,62 +202,77 @@ class RecordingOptions(OutputOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class LookOptions(RecordingOptions):
-    """Options of `invertwin look`."""
+    """Options of `invertwin look`.
 
-    chirp: Annotated[
-        int | None, option("The one that the capture keeps; default: mean.", min=0)
-    ] = None
-    frame: Annotated[int, option("The one that the pictures show.", min=0)] = 0
-    range_min: Annotated[float | None, option("m; default: 3 range cells.")] = None
-    range_max: Annotated[float | None, option("m; default: all.")] = None
-    method: Annotated[
-        Literal["bartlett", "capon", "music"],
-        option("Of directions; others than bartlett are shown beside it."),
-    ] = "bartlett"
-    sources: Annotated[int | None, option("For music; default: counted in each range.")] = None
-    channels: Annotated[
-        Path | None, option("Channel calibration to divide out (channels.json).")
-    ] = None
-    reflector: Annotated[
-        tuple[float, float, float] | None,
-        option("x y z in m of a reflector: calibrates the channels on it."),
-    ] = None
+    Attributes:
+        chirp: The one that the capture keeps; default: mean.
+        frame: The one that the pictures show.
+        range_min: m; default: 3 range cells.
+        range_max: m; default: all.
+        method: Of directions; others than bartlett are shown beside it.
+        sources: For music; default: counted in each range.
+        channels: Channel calibration to divide out (channels.json).
+        reflector: x y z in m of a reflector: calibrates the channels on it.
+    """
+
+    chirp: Annotated[int | None, typer.Option(min=0)] = None
+    frame: Annotated[int, typer.Option(min=0)] = 0
+    range_min: float | None = None
+    range_max: float | None = None
+    method: Literal["bartlett", "capon", "music"] = "bartlett"
+    sources: int | None = None
+    channels: Path | None = None
+    reflector: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwinOptions(RecordingOptions):
-    """Options of `invertwin twin`."""
+    """Options of `invertwin twin`.
 
-    low: Annotated[
-        tuple[float, float] | None,
-        option("Corner x y of the ground searched, m; default: all that is seen."),
-    ] = None
-    high: Annotated[tuple[float, float] | None, option("Opposite corner, m.")] = None
-    range_max: Annotated[float | None, option("m; default: the last range with echoes.")] = None
-    level: Annotated[float | None, option("z of the ground, m; default: 0.6 below the radars.")] = (
-        None
-    )
-    height: Annotated[
-        float | None,
-        option("Above the ground, where echoes are looked for, m; default: the radars'."),
-    ] = None
-    rays: Annotated[int | None, option("Of every frame in fits; default: 2000.", min=100)] = None
-    seed: Annotated[int | None, option("Of rays; default: 0.", min=0, max=2**31 - 1)] = None
+    Attributes:
+        low: Corner x y of the ground searched, m; default: all that is seen.
+        high: Opposite corner, m.
+        range_max: m; default: the last range with echoes.
+        level: z of the ground, m; default: 0.6 below the radars.
+        height: Above the ground, where echoes are looked for, m; default: the radars'.
+        rays: Of every frame in fits; default: 2000.
+        seed: Of rays; default: 0.
+    """
+
+    low: tuple[float, float] | None = None
+    high: tuple[float, float] | None = None
+    range_max: float | None = None
+    level: float | None = None
+    height: float | None = None
+    rays: Annotated[int | None, typer.Option(min=100)] = None
+    seed: SeedOption = None
     backend: BackendOption = None
+
+
+def _add_help(field: inspect.Parameter, text: str | None) -> inspect.Parameter:
+    """An option with what the docstring says of it; one of several commands brings its own help."""
+    kind, info = field.annotation, typer.Option()
+    if get_origin(kind) is Annotated:
+        kind, info = get_args(kind)
+    if text is not None:
+        info = copy(info)
+        info.help = f"{text}."
+    return field.replace(annotation=Annotated[kind, info])
 
 
 def with_options(kind: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the fields of a dataclass as options; it gets them as one value.
 
     Args:
-        kind: The dataclass, whose annotations say what typer needs to know.
+        kind: The dataclass, whose annotations and docstring say what typer needs to know.
 
     Returns:
         A decorator of a function of that value and further options.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(kind, eval_str=True).parameters
+        texts, known = argument_docs(kind), inspect.signature(kind, eval_str=True).parameters
+        own = {name: _add_help(known[name], texts.get(name)) for name in known}
         shared = list(inspect.signature(function).parameters.values())[1:]
         rest = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in shared]
 
