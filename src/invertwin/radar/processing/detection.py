@@ -17,7 +17,7 @@ from torch import Tensor
 from invertwin.channel import Grid
 from invertwin.checks import check_choice, check_shape, checked_number, refuse_derivatives
 from invertwin.errors import InputError
-from invertwin.radar.processing.doppler import velocity_axis, velocity_span
+from invertwin.radar.processing.doppler import interpolate_peak, velocity_axis, velocity_span
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
 from invertwin.storage.folders import replace_file
@@ -310,16 +310,13 @@ def _refinement(
 
     def level(step: int) -> Tensor:
         place = (here + step) % size if wrap else (here + step).clamp(0, size - 1)
-        values = power[tuple(place if k == axis else cell[k] for k in range(5))]
-        return values.clamp(min=torch.finfo(torch.float64).tiny).log()
+        return power[tuple(place if k == axis else cell[k] for k in range(5))]
 
     before, middle, after = level(-1), level(0), level(1)
-    curvature = before - 2 * middle + after
-    offset = 0.5 * (before - after) / torch.where(curvature < 0, curvature, 1.0)
-    inside = (curvature < 0) & (middle >= before) & (middle >= after)
+    inside = (middle >= before) & (middle >= after)
     if not wrap:
         inside &= (here > 0) & (here < size - 1)
-    return torch.where(inside, offset, 0.0)
+    return torch.where(inside, interpolate_peak(before, middle, after), 0.0)
 
 
 def save_points(path: str | Path, points: PointCloud) -> None:
