@@ -157,8 +157,22 @@ class FMCW(SampledWaveform):
         return torch.arange(self.samples, dtype=torch.float64) * (self.duration / self.samples)
 
 
+class _Tones(SampledWaveform):
+    """Tones at equal frequency steps; the band ends half a step beyond the outer ones."""
+
+    @property
+    def bandwidth(self) -> float:
+        """Bandwidth, N · step [Hz]."""
+        return self.samples * self.step
+
+    @property
+    def center_frequency(self) -> float:
+        """Mean of the tones [Hz]."""
+        return self.start_frequency + 0.5 * (self.samples - 1) * self.step
+
+
 @dataclass(frozen=True)
-class SteppedFrequency(SampledWaveform):
+class SteppedFrequency(_Tones):
     """Consecutive tones, each measured after its echoes have settled.
 
     Attributes:
@@ -174,16 +188,6 @@ class SteppedFrequency(SampledWaveform):
     dwell: limits.Duration
 
     @property
-    def bandwidth(self) -> float:
-        """Bandwidth, N · step [Hz]."""
-        return self.samples * self.step
-
-    @property
-    def center_frequency(self) -> float:
-        """Mean of the tones [Hz]."""
-        return self.start_frequency + 0.5 * (self.samples - 1) * self.step
-
-    @property
     def noise_bandwidth(self) -> float:
         """Noise bandwidth, 1 / dwell [Hz]."""
         return 1 / self.dwell
@@ -195,7 +199,7 @@ class SteppedFrequency(SampledWaveform):
 
 
 @dataclass(frozen=True)
-class OFDM(SampledWaveform):
+class OFDM(_Tones):
     """Simultaneous subcarriers; known symbols are divided out, one sample per subcarrier.
 
     On every subcarrier ``Y = H X``, since the cyclic prefix is assumed longer than the largest
@@ -221,16 +225,6 @@ class OFDM(SampledWaveform):
     def step(self) -> float:
         """Frequency step of the samples: the spacing [Hz]."""
         return self.spacing
-
-    @property
-    def bandwidth(self) -> float:
-        """Bandwidth, N · spacing [Hz]."""
-        return self.subcarriers * self.spacing
-
-    @property
-    def center_frequency(self) -> float:
-        """Mean of the subcarriers [Hz]."""
-        return self.start_frequency + 0.5 * (self.subcarriers - 1) * self.spacing
 
     @property
     def noise_bandwidth(self) -> float:
