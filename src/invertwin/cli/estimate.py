@@ -15,8 +15,7 @@ from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.signature import count_values
 from invertwin.errors import InputError
 from invertwin.inversion import require_edge_length
-from invertwin.radar import SampledWaveform
-from invertwin.radar.radar import Radar
+from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.signal.range_profile import fft_bins
 from invertwin.runtime.memory import format_gigabytes, free_memory, require_at_most
 from invertwin.scene import Mesh, Object, Scene

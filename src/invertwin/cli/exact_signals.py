@@ -9,8 +9,7 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
 from invertwin.errors import InputError
-from invertwin.radar.radar import Radar
-from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar import Chirps, Radar
 from invertwin.scene import Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
 

@@ -17,11 +17,9 @@ from invertwin.channel import visible_points
 from invertwin.checks import ArrayLike, checked_count, checked_number
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_at_most
-from invertwin.scene import Itu, Material
+from invertwin.scene import Itu, Material, Mesh, Object
 from invertwin.scene.material.materials import select_layer
 from invertwin.scene.material.values import Value, evaluate_value
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Object
 
 SURFACE_POINT_COUNT = 20_000  # points on each surface
 VOXEL_EDGE = 0.02  # [m]

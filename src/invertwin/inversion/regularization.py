@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from invertwin.checks import check_shape
 from invertwin.errors import InputError
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene import Mesh, Scene
 
 Regularizer = Callable[[Scene], Float64[Tensor, ""]]
 

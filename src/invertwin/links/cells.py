@@ -27,8 +27,7 @@ from invertwin.limits import Count
 from invertwin.links.places import ReceiverLocations
 from invertwin.links.received import LinkStatistics, PropagationSettings, delay_spread_from_moments
 from invertwin.links.transmitters import Transmitters
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.scene import Scene
+from invertwin.scene import Mesh, Scene
 
 _Points = Float64[Tensor, "row 3"]
 _FaceNumbers = Int64[Tensor, " row"]

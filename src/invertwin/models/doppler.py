@@ -15,11 +15,8 @@ from invertwin.channel import Grid, Paths, Sampling
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
-from invertwin.radar.processing.doppler import range_doppler_angle, velocity_axis
-from invertwin.radar.radar import Radar
-from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar import Chirps, Radar, SampledWaveform, range_doppler_angle, velocity_axis
 from invertwin.radar.surrogate.range_doppler import range_doppler_power
-from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate_chirps

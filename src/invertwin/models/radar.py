@@ -16,12 +16,9 @@ from invertwin.checks import checked_count, set_fields
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel, Realisations
 from invertwin.models.noise import noisy_realisations
-from invertwin.radar.processing.beamforming import exact_spectrum
-from invertwin.radar.radar import Radar
-from invertwin.radar.signal.range_profile import beat_signal
+from invertwin.radar import Radar, SampledWaveform, beat_signal, exact_spectrum
 from invertwin.radar.signal.realisations import SpeckleRealisations
 from invertwin.radar.surrogate import surrogate as surrogates
-from invertwin.radar.waveform import SampledWaveform
 from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate

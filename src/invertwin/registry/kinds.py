@@ -10,6 +10,7 @@ import inspect
 import math
 import pkgutil
 import re
+import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
@@ -17,17 +18,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    NamedTuple,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 from annotated_types import Len, MinLen
 from pydantic import Discriminator, Field, GetCoreSchemaHandler, Tag, create_model, model_validator
@@ -308,7 +299,7 @@ class Registry:
         if isinstance(make, type) and issubclass(make, section.Section):
             return make
         plain = isinstance(make, type) and not is_dataclass(make)
-        hints = get_type_hints(make.__init__ if plain else make, include_extras=True)
+        hints = typing.get_type_hints(make.__init__ if plain else make, include_extras=True)
         documents = {**_ARGUMENT_DOCS, **section.argument_docs(make)}
         made: dict[str, Any] = dict(fields or {})
         arguments: dict[str, tuple[str | None, Any]] = {}
@@ -384,7 +375,7 @@ class Registry:
             return section.InputPath
         if hasattr(hint, "dim_str"):
             return _nested_list_type(hint.dim_str.split())
-        if origin in (Union, UnionType):
+        if origin in (typing.Union, UnionType):
             allowed = [part for part in arguments if part is not NoneType]
             kinds = [self.run_file_type(part, name) for part in allowed if not _is_array(part)]
             lists = [list[float]] if any(_is_array(member) for member in members) else []
@@ -501,21 +492,21 @@ def number_or_list(*kinds: Any) -> Any:
 
 
 def _union_type(kinds: Sequence[Any]) -> Any:
-    return Union[tuple(kinds)]  # noqa: UP007 - of kinds that are known at run time
+    return typing.Union[tuple(kinds)]  # noqa: UP007 - of kinds that are known at run time
 
 
 def _union_members(hint: Any) -> tuple[Any, ...]:
     """The types that an annotation allows, without its limits."""
     if get_origin(hint) is Annotated:
         return _union_members(get_args(hint)[0])
-    if get_origin(hint) in (Union, UnionType):
+    if get_origin(hint) in (typing.Union, UnionType):
         return tuple(member for part in get_args(hint) for member in _union_members(part))
     return (hint,)
 
 
 def _annotation_marks(hint: Any) -> tuple[Any, ...]:
     found = hint.__metadata__ if get_origin(hint) is Annotated else ()
-    if get_origin(hint) in (Union, UnionType, Annotated):
+    if get_origin(hint) in (typing.Union, UnionType, Annotated):
         found += tuple(mark for part in get_args(hint) for mark in _annotation_marks(part))
     return found
 

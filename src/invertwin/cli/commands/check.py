@@ -10,14 +10,9 @@ from rich.console import Console
 
 from invertwin.channel import Sampling
 from invertwin.channel.sampling import resolve_densities
+from invertwin.cli import estimate
 from invertwin.cli.commands.gradcheck import checked_map
-from invertwin.cli.estimate import (
-    ResourceEstimate,
-    SensorSetup,
-    estimate_rcs_resources,
-    estimate_resources,
-    estimate_sensor_resources,
-)
+from invertwin.cli.estimate import ResourceEstimate, SensorSetup
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import make_observations, make_schedule
@@ -60,7 +55,7 @@ def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
     truth, sensors = build.true_scene(run), _build_sensors(run)
     tables = [table for table in run.parameters if not isinstance(table, MovingTargetParameter)]
     build.parameters(tables, build.scene(run), run.scene)
-    found = estimate_resources(run, truth, sensors)
+    found = estimate.estimate_resources(run, truth, sensors)
     found.require_available()
     seconds = _estimate_seconds(run, found, truth, sensors)
     work = f"{found.ray_count:.2g} rays and {found.path_count:.2g} paths"
@@ -140,7 +135,7 @@ def _time_call(work: Callable[[], object]) -> float:
 def _check_rcs(run: RunFile) -> _Needs:
     """Check `[rcs]`: extrapolate its time from one aspect and a few more."""
     table, scene = require_section(run, "rcs", run.task), build.scene(run)
-    found = estimate_rcs_resources(run, scene)
+    found = estimate.estimate_rcs_resources(run, scene)
     found.require_available()
     count = table.aspect_count
 
@@ -235,7 +230,7 @@ def _predict_map(sensor: SensorSetup, truth: Scene, depth: int, count: int, fitt
 def _simulate_signals(sensor: SensorSetup, truth: Scene, count: int) -> float:
     """Simulate exact signals of about so many paths; return their number."""
     data = require_section(sensor.run, "data", "a simulation")
-    whole = estimate_sensor_resources(sensor, truth)[1]
+    whole = estimate.estimate_sensor_resources(sensor, truth)[1]
     share, rough = min(1.0, count / whole), resolve_densities(truth, data.points_per_m2)
     fewer = {
         "points_per_m2": {name: density * share for name, density in rough.items()},

@@ -23,9 +23,7 @@ from invertwin.forward_model import ForwardModel
 from invertwin.inversion.gradcheck.gradcheck import GradientAgreement, GradientReport, gradcheck
 from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.links import MapPlane, ReceiverPoints
-from invertwin.models.radar import SurrogateMap
-from invertwin.models.radio import PanelMap
-from invertwin.models.rcs import RcsMap
+from invertwin.models import PanelMap, RcsMap, SurrogateMap
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
 from invertwin.signatures import Signature

@@ -13,8 +13,7 @@ from torch import Tensor
 from invertwin import viewer
 from invertwin.cli.fits.problem import Fits, Problem, SensorData, Start
 from invertwin.errors import InputError
-from invertwin.inversion import Callback
-from invertwin.inversion.fit import Fit
+from invertwin.inversion import Callback, Fit
 from invertwin.links import Metasurface, PropagationSettings, ReceiverPoints, Transmitters
 from invertwin.links.metasurface.coverage import Coverage
 from invertwin.models.radio import RadioMap

@@ -12,20 +12,9 @@ from rich.console import Console
 
 from invertwin import discovery, inversion
 from invertwin.capture import Capture, calibrate
+from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.displays import StepRecorder, steps_path
-from invertwin.cli.fits.problem import (
-    AMONG_CLUTTER,
-    FROM_IMAGE,
-    OWN_METHOD,
-    Fits,
-    Problem,
-    Row,
-    Start,
-    make_observations,
-    make_schedule,
-    make_unknowns,
-    rank,
-)
+from invertwin.cli.fits.problem import Fits, Problem, Row, Start
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
 from invertwin.cli.report import format_place
@@ -70,11 +59,11 @@ def fit_all(
         rows[method].append(row)
         if method not in problem.run.variants:
             outcomes[method, number] = outcome
-    best = min(rows[OWN_METHOD], key=rank)
+    best = min(rows[problems.OWN_METHOD], key=problems.rank)
     number = best["start"]
     own = problem.kind.with_recording_of_start(problem, number, console)
-    own = problem.kind.with_method(own, OWN_METHOD)
-    start, found = problem.starts()[number], outcomes[OWN_METHOD, number]()
+    own = problem.kind.with_method(own, problems.OWN_METHOD)
+    start, found = problem.starts()[number], outcomes[problems.OWN_METHOD, number]()
     fits = Fits(own, rows, lambda method, k: outcomes[method, k](), best, start, found)
     return _fit_from_image(_fit_among_clutter(fits, folder, console), folder, console)
 
@@ -92,11 +81,11 @@ def _fit_from_image(fits: Fits, folder: RunFolder, console: Console) -> Fits:
         return fits
     begun = displace(start.scene[name], peak - start.scene[name].center)
     start = replace(start, scene=start.scene.replace(name, pose=begun.transform))
-    row, outcome = run_fit(problem, start, number, FROM_IMAGE, folder, console)
+    row, outcome = run_fit(problem, start, number, problems.FROM_IMAGE, folder, console)
     ends = " for ".join(f"({format_place(place.tolist())}) m" for place in (peak, left))
     doubt = f"with blurred kernels the fit left the echo of the image at {ends}"
     found = replace(outcome(), doubts=(doubt,))
-    rows = {**fits.rows, FROM_IMAGE: [row]}
+    rows = {**fits.rows, problems.FROM_IMAGE: [row]}
     problem = replace(problem, notes={**problem.notes, "image_peak_m": peak.tolist()})
     return replace(fits, problem=problem, rows=rows, best=row, found=found)
 
@@ -133,7 +122,7 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     if wanted == "auto" and not discovery.needs_clutter(fits.found):
         return fits
     try:
-        row, outcome = run_fit(problem, fits.start, number, AMONG_CLUTTER, folder, console)
+        row, outcome = run_fit(problem, fits.start, number, problems.AMONG_CLUTTER, folder, console)
     except InputError as error:
         if wanted == "always":
             raise
@@ -141,12 +130,12 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
         return replace(fits, problem=replace(problem, notes=notes))
     among = outcome()
     kept = wanted == "always" or discovery.choose_result(fits.found, among) is among
-    observation = make_observations(problem, fits.start)[0]
+    observation = problems.make_observations(problem, fits.start)[0]
     moved = [n for n in dict.fromkeys(problem.run.fitted_objects) if n in among.scene.names]
     clutter = discovery.estimate_clutter(among.scene, observation, moved, seed=problem.run.seed)
     share = float(clutter.echoes.sum() / observation.observed_map().sum())
     summary = {"kept": kept, "share": share, "strongest_m": clutter.strongest_position.tolist()}
-    rows = {**fits.rows, AMONG_CLUTTER: [row]}
+    rows = {**fits.rows, problems.AMONG_CLUTTER: [row]}
     problem = replace(problem, notes={**problem.notes, "clutter": summary})
     fits = replace(fits, problem=problem, rows=rows)
     return replace(fits, best=row, found=among) if kept else fits
@@ -179,15 +168,17 @@ def run_fit(
     # Among the parts: a later fit's outcome does not take its place.
     checkpoint = f"{part}.pt"
     own = problem.kind.with_method(problem, method)
-    stages = make_schedule(own)
+    stages = problems.make_schedule(own)
     again = partial(_fit_or_search, own, stages, start, index, folder, checkpoint, show, method)
     row = folder.read_json(f"{part}.json")
     if row is not None:
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
-    name = f"start {index + 1}" + ("" if method == OWN_METHOD else f", {method.replace('_', ' ')}")
-    steps = sum(stage.steps for stage in stages) * (4 if method == AMONG_CLUTTER else 1)
+    name = f"start {index + 1}" + (
+        "" if method == problems.OWN_METHOD else f", {method.replace('_', ' ')}"
+    )
+    steps = sum(stage.steps for stage in stages) * (4 if method == problems.AMONG_CLUTTER else 1)
     with inversion.report_progress(name, steps, console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
@@ -239,11 +230,15 @@ def _fit_or_search(
         )
         return [*watching, *shown, _make_checkpoint(problem, folder, file), kept]
 
-    given = start.scene, make_observations(problem, start), make_unknowns(problem, start)
+    given = (
+        start.scene,
+        problems.make_observations(problem, start),
+        problems.make_unknowns(problem, start),
+    )
     seed = derive_seed(run.seed, index)
     how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
     how["optimizer"] = build.build_section(run, "optimizer")
-    if method == FROM_IMAGE:
+    if method == problems.FROM_IMAGE:
         # Kernels without blur reach far, too: all steps together move a tenth of a cell.
         rate = 0.1 * problem.first_sensor.sensor.waveform.range_resolution / stages[0].steps
         slow = replace(how["optimizer"], rate=rate, final_rate=None)
@@ -252,7 +247,7 @@ def _fit_or_search(
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
         how["callbacks"] = callbacks(checkpoint)
         return inversion.reconstruct(start.scene, sharp, unknowns, **how), {}
-    if method == AMONG_CLUTTER:
+    if method == problems.AMONG_CLUTTER:
         # Every frame has clutter of its own.
         how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]
         part = f"{PARTS}/{Path(checkpoint).stem}_round"

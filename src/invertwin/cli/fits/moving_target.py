@@ -17,17 +17,8 @@ from invertwin.channel import Sampling
 from invertwin.cli import report
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    DataKind,
-    Fits,
-    Problem,
-    Row,
-    SensorData,
-    Start,
-    Summary,
-    require_sections,
-)
+from invertwin.cli.fits import problem as problems
+from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
@@ -63,7 +54,7 @@ class MovingTarget(DataKind):
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the strongest echo that moves."""
-        require_sections(self, run, "a moving target")
+        problems.require_sections(self, run, "a moving target")
         table, recording = _table(run), _read_recording(run, truth)
         radar = recording.radar()
         grid = build.grid(require_section(run, "grid", "reconstruct"), radar)
@@ -148,7 +139,7 @@ class MovingTarget(DataKind):
             **{key: best[key] for key in errors if key in best},
         }
         if "success" in best:
-            found["successes"] = sum(row["success"] for row in fits.rows[OWN_METHOD])
+            found["successes"] = sum(row["success"] for row in fits.rows[problems.OWN_METHOD])
         return found
 
     def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
@@ -222,7 +213,7 @@ def _make_twins(fits: Fits) -> list[discovery.MovingTargetFit]:
     """The twin of the best fit, and that of the first half from the same start."""
     number, problem = fits.best["start"], fits.problem
     twins = []
-    for method, found in ((OWN_METHOD, fits.found), (HALF, fits.outcome(HALF, number))):
+    for method, found in ((problems.OWN_METHOD, fits.found), (HALF, fits.outcome(HALF, number))):
         own = problem.kind.with_method(problem, method)
         model, recording = _whole_map(own), own.first_sensor.recording
         twins.append(discovery.MovingTargetFit(recording, model, _find_body(found), found))
@@ -258,7 +249,7 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[report.ReportPicture]:
     with torch.no_grad():
         unknown = problem.kind.make_unknown(problem, "", table, fits.start)
         scenes = {"start": unknown.build_module(fits.start.scene)(scene), "twin": whole.body(scene)}
-    names = {OWN_METHOD: "twin", HALF: "twin of the first half"}
+    names = {problems.OWN_METHOD: "twin", HALF: "twin of the first half"}
     losses = {names.get(how, how.replace("_", " ")): own for how, own in fits.losses.items()}
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)
     where = plotting.scene(scenes, radar, highlight=[whole.body.object])

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.cli.fits import problem as problems
+from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import drop_histories, error_bar_table
 from invertwin.cli.report import ReportTable, load_texts, save_picture
 from invertwin.cli.run_file import require_section
@@ -36,7 +37,7 @@ _CELLS = 2500  # of a drawn map
 _FLOOR = 1e-16
 
 
-class PanelCoverage(problems.DataKind):
+class PanelCoverage(DataKind):
     """An aim instead of data: the path loss that the worst share of receivers exceeds."""
 
     title: ClassVar[str] = "Placement of a metasurface"
@@ -45,34 +46,30 @@ class PanelCoverage(problems.DataKind):
         *("starts", "map", "initial"),
     )
 
-    def read_problem(
-        self, run: RunFile, scene: Scene, truth: Scene, console: Console
-    ) -> problems.Problem:
+    def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the receivers that score the panel."""
         problems.require_sections(self, run, "[placement]")
         table = require_section(run, "placement", "reconstruct")
-        item = problems.SensorData(table.coverage(scene, run.seed), table.metasurface())
+        item = SensorData(table.coverage(scene, run.seed), table.metasurface())
         scored = table.coverage(scene, run.seed, scored=True)
-        return problems.Problem(run, scene, truth, frozenset(), {"": item}, None, self, scored)
+        return Problem(run, scene, truth, frozenset(), {"": item}, None, self, scored)
 
-    def recorded_values(self, item: problems.SensorData) -> Tensor:
+    def recorded_values(self, item: SensorData) -> Tensor:
         """The path loss without a panel [dB]."""
         return -item.recording.worst(item.recording.direct).reshape(1, 1)
 
-    def models(self, problem: problems.Problem) -> list[ForwardModel]:
+    def models(self, problem: Problem) -> list[ForwardModel]:
         """See ``DataKind.models``."""
         table, settings = _table(problem), problem.run.fit_settings
         blur, soft = table.edge_width, table.softness
         batch = table.receivers.batch
         return [CoverageMap(problem.first_sensor.recording, batch, blur, soft, settings.boundary)]
 
-    def starts(self, problem: problems.Problem) -> list[problems.Start]:
+    def starts(self, problem: Problem) -> list[Start]:
         """As many as the run file says; they differ by the random numbers of ``[search]``."""
-        return [problems.Start(problem.scene)] * _table(problem).starts
+        return [Start(problem.scene)] * _table(problem).starts
 
-    def make_unknown(
-        self, problem: problems.Problem, name: str, table: Any, start: problems.Start
-    ) -> Unknown:
+    def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
         """The position and beam of the panel, or the phases of its elements."""
         own = _table(problem)
         if table.kind == "panel_phases":
@@ -82,7 +79,7 @@ class PanelCoverage(problems.DataKind):
         return super().make_unknown(problem, name, table, start)
 
     def make_candidates(
-        self, problem: problems.Problem, start: problems.Start, generator: torch.Generator
+        self, problem: Problem, start: Start, generator: torch.Generator
     ) -> Sequence[Candidate]:
         """Placements that ``[search]`` compares."""
         named = build.tables_by_name(problem.run.parameters)
@@ -96,9 +93,7 @@ class PanelCoverage(problems.DataKind):
             found.append(Candidate(start.scene, [replace(observation, parameters=own)], group))
         return found
 
-    def score_fit(
-        self, problem: problems.Problem, start: problems.Start, found: Reconstruction
-    ) -> problems.Row:
+    def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
         """Levels of the worst receivers, of those that the fit sees and of the others [dB]."""
         panel, batch = found.sensors[0], _table(problem).receivers.batch
         seen = problem.first_sensor.recording.part(slice(0, batch))
@@ -119,11 +114,11 @@ class PanelCoverage(problems.DataKind):
                 "evaluations": tried + (1 + _DERIVATIVE) * sum(steps),
             }
 
-    def metrics(self, fits: problems.Fits) -> problems.Row:
+    def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""
         scored, best = fits.problem.reference, fits.best
         before = float(scored.worst(scored.direct))
-        found: problems.Row = {
+        found: Row = {
             "evaluations": fits.rows[problems.OWN_METHOD][0]["evaluations"],
             "worst_before_db": before,
             "worst_after_db": best["scored_db"],
@@ -146,9 +141,7 @@ class PanelCoverage(problems.DataKind):
             found[f"successes{tail}"] = sum(ratio >= _AS_GOOD for ratio in ratios)
         return found | {"starts": rows}
 
-    def summary(
-        self, fits: problems.Fits, metrics: problems.Row, folder: RunFolder
-    ) -> problems.Summary:
+    def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
         """See ``DataKind.summary``."""
         problem, notes = fits.problem, load_texts("notes")
         drawn = [save_picture(folder, "loss", plotting.convergence(fits.losses))]
@@ -165,24 +158,24 @@ class PanelCoverage(problems.DataKind):
         if "successes" in metrics:
             reached = f"{metrics['successes']} of {count} starts reach {_AS_GOOD:g} of the best of"
             outcome = f"{reached} the grid; {outcome}"
-        return problems.Summary(outcome, result, drawn, [error_bar_table(metrics)])
+        return Summary(outcome, result, drawn, [error_bar_table(metrics)])
 
 
-def _table(problem: problems.Problem) -> Placement:
+def _table(problem: Problem) -> Placement:
     return require_section(problem.run, "placement", "a metasurface")
 
 
-def _search(problem: problems.Problem) -> Any:
+def _search(problem: Problem) -> Any:
     return require_section(problem.run, "search", "placements to compare")
 
 
-def _start_panel(problem: problems.Problem, table: Any, trial: Trial) -> Unknown:
+def _start_panel(problem: Problem, table: Any, trial: Trial) -> Unknown:
     """The module of a panel that starts at a trial."""
     make = partial(_table(problem).place, problem.first_sensor.recording, trial)
     return Unknown(lambda _: make(), table.rate)
 
 
-def _landscape(fits: problems.Fits) -> Any:
+def _landscape(fits: Fits) -> Any:
     """The level of the best trial of the grid at each position, and where fits have ended."""
     problem = fits.problem.kind.with_method(fits.problem, EXHAUSTIVE)
     table, search = _table(problem), _search(problem)
@@ -197,7 +190,7 @@ def _landscape(fits: problems.Fits) -> Any:
     return plotting.placements(places, levels, torch.tensor(ends, dtype=torch.float64))
 
 
-def _coverage(problem: problems.Problem, panel: Metasurface) -> Any:
+def _coverage(problem: Problem, panel: Metasurface) -> Any:
     """Path gain over the floor plan, without the panel and with it."""
     table, seen = _table(problem), problem.first_sensor.recording
     box = table.receivers

@@ -14,14 +14,8 @@ from torch import Tensor, nn
 
 from invertwin.cli.report import ReportPicture, ReportTable
 from invertwin.cli.run_file import prefix_errors, require_section
-from invertwin.cli.schema import (
-    MeasuresTable,
-    RunFile,
-    SamplingBase,
-    SimulatedData,
-    StageTable,
-    build,
-)
+from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, StageTable, build
+from invertwin.cli.schema.fits import MeasuresTable
 from invertwin.cli.schema.shape_tables import shape_regularizers
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel

@@ -8,20 +8,10 @@ from rich.console import Console
 from torch import Tensor
 
 from invertwin.cli.estimate import require_resources
+from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits import radar_models, scores
 from invertwin.cli.fits.fitting import calibrate_problem
-from invertwin.cli.fits.problem import (
-    OF_SENSORS,
-    OWN_METHOD,
-    DataKind,
-    Fits,
-    Problem,
-    Row,
-    Start,
-    Summary,
-    known_truth,
-    sensor_runs,
-)
+from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, Start, Summary
 from invertwin.cli.fits.shape_scores import is_shape_key
 from invertwin.cli.fits.writing import START_COLUMNS, describe_outcome, draw_pictures, make_tables
 from invertwin.cli.schema import RunFile, SimulatedData, build
@@ -34,7 +24,7 @@ from invertwin.runtime.memory import peak_memory
 from invertwin.scene import Scene
 from invertwin.storage.run_folder import RunFolder
 
-_RIGID = {"translation", "pose", "material", *OF_SENSORS}
+_RIGID = {"translation", "pose", "material", *problems.OF_SENSORS}
 
 
 class RadarMaps(DataKind):
@@ -46,7 +36,9 @@ class RadarMaps(DataKind):
         radar_models.warn_if_depths_differ(run, sensors)
         require_resources(run, truth, sensors)
         data = radar_models.record_sensors(run, sensors, truth, console)
-        simulated = all(isinstance(own.data, SimulatedData) for own in sensor_runs(run).values())
+        simulated = all(
+            isinstance(own.data, SimulatedData) for own in problems.sensor_runs(run).values()
+        )
         known = frozenset(truth.names if simulated else run.truth)
         target = run.starts.object if run.starts else next(iter(run.fitted_objects), None)
         return Problem(run, scene, truth, known, data, target, kind=self)
@@ -88,7 +80,7 @@ class RadarMaps(DataKind):
         """Distances to the truth; of a recording of its own, error bars, too."""
         rows = scores.score_fit(problem, start.scene, found.scene)
         own = radar_models.has_recording_per_start(problem.run)
-        return rows | (confidence_metrics(found, known_truth(problem)) if own else {})
+        return rows | (confidence_metrics(found, problems.known_truth(problem)) if own else {})
 
     def measured_maps(self, problem: Problem) -> list[Tensor]:
         """Spectra of the recordings."""
@@ -109,7 +101,7 @@ class RadarMaps(DataKind):
         problem, rows, best, methods = fits.problem, fits.rows, fits.best, fits.methods
         found: Row = scores.summarise_successes(problem, rows, methods)
         if radar_models.has_recording_per_start(problem.run):
-            found |= error_bar_coverage(rows[OWN_METHOD])
+            found |= error_bar_coverage(rows[problems.OWN_METHOD])
         told = [k for k in best if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"]
         measured = fits.maps["measured"]
         found |= {
@@ -117,7 +109,7 @@ class RadarMaps(DataKind):
             "start_loss_sharp": scores.total_loss(problem, fits.maps["start"], measured),
             "loss_sharp": scores.total_loss(problem, fits.maps["twin"], measured),
             **scores.surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),
-            **scores.score_held_out(problem, rows[OWN_METHOD], best),
+            **scores.score_held_out(problem, rows[problems.OWN_METHOD], best),
         }
         for method in methods[1:]:
             same = rows[method][min(best["start"], len(rows[method]) - 1)]

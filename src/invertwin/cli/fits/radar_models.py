@@ -18,11 +18,9 @@ from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
 from invertwin.cli.schema.recordings import build_capture
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
+from invertwin.inversion import InitialPoseEstimator, pose_error
 from invertwin.inversion.initialisation.detections import estimate_density
-from invertwin.inversion.initialisation.initial_pose import InitialPoseEstimator
-from invertwin.inversion.metrics import pose_error
-from invertwin.models.facets import FacetMap
-from invertwin.models.radar import ExactMap, SurrogateMap
+from invertwin.models import ExactMap, FacetMap, SurrogateMap
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed

@@ -13,18 +13,8 @@ from torch import Tensor
 
 from invertwin import plotting
 from invertwin.channel import trace_paths
-from invertwin.cli.fits.problem import (
-    OWN_METHOD,
-    DataKind,
-    Fits,
-    Problem,
-    Row,
-    SensorData,
-    Start,
-    Summary,
-    rank,
-    require_sections,
-)
+from invertwin.cli.fits import problem as problems
+from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table, score_fit
 from invertwin.cli.fits.writing import describe_outcome, parameter_values
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
@@ -57,7 +47,7 @@ class ReceivedLevels(DataKind):
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the true transmitters, where known."""
-        require_sections(self, run, "[map]")
+        problems.require_sections(self, run, "[map]")
         with prefix_errors("transmitter"):
             sensor = require_section(run, "transmitter", "[map]").build()
         data = require_section(run, "data", "reconstruct")
@@ -157,7 +147,7 @@ class ReceivedLevels(DataKind):
         """Verdict and error bars; ends of other starts may speak against them."""
         others = _find_other_ends(fits)
         run, bars = fits.problem.run, believed.get("within_95", {})
-        spread = spread_of_ends(run, fits.rows[OWN_METHOD], fits.best, bars)
+        spread = spread_of_ends(run, fits.rows[problems.OWN_METHOD], fits.best, bars)
         alone = bool(spread) and not spread["ends_within_bars"]
         doubtful = (others or alone) and believed["verdict"] == "consistent"
         return {**believed, **others, **spread, **({"verdict": "ambiguous"} if doubtful else {})}
@@ -168,7 +158,7 @@ class ReceivedLevels(DataKind):
         found: Row = {}
         materials = _true_materials(fits.problem)
         for method in fits.methods:
-            tail = "" if method == OWN_METHOD else f"_{method}"
+            tail = "" if method == problems.OWN_METHOD else f"_{method}"
             if "success" in best:
                 found[f"successes{tail}"] = sum(row["success"] for row in rows[method])
                 found[f"errors_m{tail}"] = [row["position_error_m"] for row in rows[method]]
@@ -179,7 +169,7 @@ class ReceivedLevels(DataKind):
         if "success" in best:
             found |= {key: best[key] for key in ("position_error_m", "success")}
         if "start_error_m" in best:
-            found["start_errors_m"] = [row["start_error_m"] for row in rows[OWN_METHOD]]
+            found["start_errors_m"] = [row["start_error_m"] for row in rows[problems.OWN_METHOD]]
         found |= {"true_values": materials} if materials else {}
         return found | _share_blocked_links(fits.problem, fits.found)
 
@@ -259,10 +249,10 @@ def _find_other_ends(fits: Fits) -> Row:
         return {}
     limit, best = run.fit_settings.position_limit, fits.found
     kept, told = [best.sensors[0].positions[0].detach()], []
-    for row in sorted(fits.rows[OWN_METHOD], key=rank):
+    for row in sorted(fits.rows[problems.OWN_METHOD], key=problems.rank):
         if row["start"] == fits.best["start"]:
             continue
-        end = fits.outcome(OWN_METHOD, row["start"])
+        end = fits.outcome(problems.OWN_METHOD, row["start"])
         place = end.sensors[0].positions[0].detach()
         if min(float((place - other).norm()) for other in kept) <= limit:
             continue
@@ -353,7 +343,7 @@ def _plan(fits: Fits) -> Figure:
     points = radio_map(problem.run, problem.first_sensor.recording[1]).places
     if isinstance(points, ReceiverPoints):
         shown["receivers"] = points.positions
-    rows = fits.rows[OWN_METHOD]
+    rows = fits.rows[problems.OWN_METHOD]
     ends = [[row["start_position"], row["values"]["transmitter.position"]] for row in rows]
     starts = torch.tensor(ends, dtype=torch.float64)
     return plotting.transmitter_fits(fits.found.scene, float(place[0, 2]), shown, starts)
@@ -362,9 +352,9 @@ def _plan(fits: Fits) -> Figure:
 def _method_table(fits: Fits, metrics: Row) -> ReportTable:
     cells = []
     for method in fits.methods:
-        tail = "" if method == OWN_METHOD else f"_{method}"
+        tail = "" if method == problems.OWN_METHOD else f"_{method}"
         errors = sorted(metrics[f"errors_m{tail}"])
-        name = "full" if method == OWN_METHOD else method.replace("_", " ")
+        name = "full" if method == problems.OWN_METHOD else method.replace("_", " ")
         cells.append([name, metrics[f"successes{tail}"], errors[len(errors) // 2], errors[-1]])
     heads = ["fit", "successes", "median error [m]", "largest error [m]"]
     return ReportTable("Ways to fit", heads, cells)

@@ -19,8 +19,7 @@ from invertwin.inversion.confidence.report import COORDINATES
 from invertwin.inversion.loss import Objective
 from invertwin.inversion.metrics import axis_error, material_errors, pose_error
 from invertwin.models.radar import surrogate_correlation
-from invertwin.radar.radar import Radar
-from invertwin.radar.waveform import SampledWaveform
+from invertwin.radar import Radar, SampledWaveform
 from invertwin.scene import Mesh, Scene, SkinnedBody
 from invertwin.scene.shape_models.density import replace_clouds
 

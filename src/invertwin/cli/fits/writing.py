@@ -7,19 +7,12 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from invertwin import plotting
+from invertwin.cli import report
 from invertwin.cli.fits.problem import INTERIOR_ONLY, OWN_METHOD, Fits, Problem, Row
 from invertwin.cli.fits.radar_models import blur_end_step
 from invertwin.cli.fits.scores import ANGLES, DOUBTED, error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
-from invertwin.cli.report import (
-    ReportPicture,
-    ReportTable,
-    format_cell,
-    format_place,
-    load_texts,
-    quantity_table,
-    save_picture,
-)
+from invertwin.cli.report import ReportPicture, ReportTable, format_cell, format_place, load_texts
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.scene import Mesh, Scene
 from invertwin.scene.material.values import RANGES
@@ -90,7 +83,7 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
         place = format_place(metrics["image_peak_m"])
         rows.append(["made again from the echo of the image", f"({place}) m"])
     skip = () if blur_end_step(run) else ("start_loss_sharp", "loss_sharp")
-    rows.extend(map(list, quantity_table("", metrics, skip=skip).rows))
+    rows.extend(map(list, report.quantity_table("", metrics, skip=skip).rows))
     made_of = {key: name for key, name in _MATERIAL_ERRORS.items() if key in metrics}
     rows += [[f"{name}, share off the truth", metrics[key]] for key, name in made_of.items()]
     for key in metrics:
@@ -100,7 +93,7 @@ def _result_table(run: RunFile, metrics: dict[str, Any]) -> ReportTable:
             if found not in metrics:
                 rows.append([shape_label(found), None])
     calibration = {k: _format_status(k, v) for k, v in metrics.get("calibration", {}).items()}
-    rows.extend(map(list, quantity_table("", calibration, label_table="calibration").rows))
+    rows.extend(map(list, report.quantity_table("", calibration, label_table="calibration").rows))
     return ReportTable("Result", ["quantity", "value"], rows)
 
 
@@ -208,25 +201,26 @@ def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPic
     outline = Scene(known) if known else None
     radars = [item.sensor for item in problem.sensor_data.values()]
     figure = plotting.scene(scenes, radars, highlight=fitted_names, outline=outline)
-    found = [save_picture(folder, "scene", figure, note="scene" if "success" in metrics else "")]
+    legend = "scene" if "success" in metrics else ""
+    found = [report.save_picture(folder, "scene", figure, note=legend)]
     data = "exact simulation" if isinstance(run.data, SimulatedData) else "measured"
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}
     for number, (name, item) in enumerate(problem.sensor_data.items()):
         titled = {titles[key]: maps[number] for key, maps in fits.maps.items()}
         file = f"spectra_{name}" if name else "spectra"
         figure = plotting.spectrum(titled, item.grid)
-        found.append(save_picture(folder, file, figure, note="spectra"))
+        found.append(report.save_picture(folder, file, figure, note="spectra"))
         if item.grid.u_count > 1 or item.sensor.frame_count > 1:
             del titled[titles["start"]]
             marked = {"twin": ends["twin"]} | ({"truth": outline} if outline else {})
             figure = plotting.from_above(titled, item.grid, item.sensor, marked)
             file = f"above_{name}" if name else "above"
-            found.append(save_picture(folder, file, figure, "From above", "above"))
+            found.append(report.save_picture(folder, file, figure, "From above", "above"))
     residuals = fits.found.verdict.residuals
     for (name, item), apart in zip(problem.sensor_data.items(), residuals, strict=False):
         figure = plotting.residuals(apart, item.grid)
         file = f"residuals_{name}" if name else "residuals"
-        found.append(save_picture(folder, file, figure, note="residuals"))
+        found.append(report.save_picture(folder, file, figure, note="residuals"))
     losses = {way: [row["losses"] for row in rows] for way, rows in by_way}
     annealed, notes = blur_end_step(run), load_texts("notes")
     before = metrics["start_loss_sharp"] if annealed else None
@@ -234,13 +228,13 @@ def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPic
     if annealed is not None:
         told = None not in (before, metrics["loss_sharp"])
         note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if told else "")
-    found.append(save_picture(folder, "loss", figure, note=note))
+    found.append(report.save_picture(folder, "loss", figure, note=note))
     if run.measures is not None:
         folder.write_bytes("turntable.gif", _draw_turntable(problem, ends, run.measures.object))
         curves = {way: [_shape_curve(row) for row in rows] for way, rows in by_way}
         if any(curve for fits in curves.values() for curve in fits):
             figure = plotting.convergence(losses, curves)
-            found.append(save_picture(folder, "convergence", figure))
+            found.append(report.save_picture(folder, "convergence", figure))
     if run.landscape is not None and "landscape" in metrics:
         minima = metrics["landscape"]["local_minima"]["exact"]
         span = {"span_mm": run.landscape.exact_span * 1e3}

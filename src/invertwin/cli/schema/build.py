@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from invertwin.cli.run_file import prefix_errors as prefix_errors
-from invertwin.cli.run_file import require_section, unknown_object_message
+from invertwin.cli.run_file import prefix_errors, require_section, unknown_object_message
 from invertwin.cli.schema import RunFile, SceneFileTable
 from invertwin.cli.schema.sensors import grid as grid
 from invertwin.cli.schema.sensors import radar as radar

@@ -12,8 +12,7 @@ from invertwin.inversion.initialisation.starts import place_at_poses, sample_nea
 from invertwin.inversion.loss import CorrelationLoss, SpectrumLoss
 from invertwin.inversion.optimizer import Optimizer
 from invertwin.limits import Count
-from invertwin.models.facets import FacetField, FacetMap
-from invertwin.models.radar import SurrogateMap
+from invertwin.models import FacetField, FacetMap, SurrogateMap
 from invertwin.radar.surrogate.surrogate import Surrogate, resolve_surrogate
 from invertwin.registry.kinds import ConstructorTable, KindGroup, Registry
 from invertwin.registry.section import raise_key_error

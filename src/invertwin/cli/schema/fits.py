@@ -8,9 +8,7 @@ from pydantic import PlainSerializer, WrapValidator
 
 from invertwin.channel import Sampling
 from invertwin.cli.schema.fit_tables import SurrogateTable
-from invertwin.inversion.initialisation.initial_pose import InitialPoseEstimator
-from invertwin.inversion.initialisation.starts import sample_nearby_poses
-from invertwin.inversion.schedule import Schedule
+from invertwin.inversion import InitialPoseEstimator, Schedule, sample_nearby_poses
 from invertwin.limits import Count, NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.registry.kinds import ConstructorTable, OneOf, TableOf, registry

@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
-from invertwin.inversion.gradcheck.tangents import GaussianBump
+from invertwin.inversion import GaussianBump, GradcheckSettings
 from invertwin.limits import Count, Positive
 from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list, registry
 from invertwin.registry.section import Depth, check_presence, raise_key_error

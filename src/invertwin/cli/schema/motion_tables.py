@@ -6,8 +6,7 @@ from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.shape_tables import ObjectTable, joint_positions, require_body
 from invertwin.errors import InputError
-from invertwin.scene import MovingScene, ObjectMotion, Scene, Waving
-from invertwin.scene.people.body import BodyTemplate
+from invertwin.scene import BodyTemplate, MovingScene, ObjectMotion, Scene, Waving
 from invertwin.scene.people.gait import PersonMotion
 
 

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from invertwin.cli.schema.radio_tables import random_points
 from invertwin.limits import Count, CountOfTwo, NonNegative, Positive
+from invertwin.links import Metasurface, PanelPlacement, WallPath
 from invertwin.links.metasurface.coverage import Coverage
-from invertwin.links.metasurface.panel import Metasurface
-from invertwin.links.metasurface.wall_path import PanelPlacement, WallPath
 from invertwin.registry.kinds import OneOf, Registry
 from invertwin.registry.section import Section, Seed, Vector, prefix_errors
 from invertwin.scene import Scene

@@ -14,8 +14,7 @@ from invertwin.links import AntennaMount, PropagationSettings, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, prefix_errors
-from invertwin.scene import AntennaArray, Mesh, Scene
-from invertwin.scene.shape_models.distance import signed_distance
+from invertwin.scene import AntennaArray, Mesh, Scene, signed_distance
 
 _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
 

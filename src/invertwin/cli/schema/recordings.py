@@ -13,18 +13,12 @@ from invertwin.cli.schema.sensors import RadarPoseTable
 from invertwin.errors import InputError
 from invertwin.limits import Count, Decibels, Positive
 from invertwin.radar.boards import Mounting
+from invertwin.registry import section
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, registry
-from invertwin.registry.section import (
-    Depth,
-    InputPath,
-    Section,
-    Seed,
-    prefix_errors,
-    raise_key_error,
-)
+from invertwin.registry.section import InputPath, prefix_errors
 
 
-class SimulatedData(Section):
+class SimulatedData(section.Section):
     """Exact signals of the true scene, with noise.
 
     Attributes:
@@ -42,18 +36,18 @@ class SimulatedData(Section):
     kind: Literal["simulated"]
     points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))]
     samples: Count = 200_000
-    depth: Depth = 3
+    depth: section.Depth = 3
     mirrors: list[str] = []
     rough_paths: Count = 200_000
     snr_db: Decibels | None = None
     noise_figure_db: Decibels | None = None
-    seed: Seed | None = None
+    seed: section.Seed | None = None
     every_start: bool = False
 
     @model_validator(mode="after")
     def _one_noise_level(self) -> "SimulatedData":
         if self.snr_db is not None and self.noise_figure_db is not None:
-            raise_key_error("expected snr_db or noise_figure_db, got both; remove one")
+            section.raise_key_error("expected snr_db or noise_figure_db, got both; remove one")
         return self
 
 

@@ -27,16 +27,9 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
+from invertwin.registry import section
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
-from invertwin.registry.section import (
-    InputPath,
-    PrintableText,
-    Section,
-    Seed,
-    Vector,
-    raise_key_error,
-    require_section,
-)
+from invertwin.registry.section import Section, Vector, raise_key_error
 from invertwin.scene.rooms import room
 from invertwin.signatures import rcs
 
@@ -70,7 +63,7 @@ class SceneFileTable(Section):
         material: material of all other objects; without it concrete
     """
 
-    file: InputPath
+    file: section.InputPath
     materials: dict[str, AnyMaterial] = {}
     material: AnyMaterial | None = None
 
@@ -193,9 +186,9 @@ class _RunFile(Section):
 
     task: Annotated[str, NameOf("task")]
     frame: Literal[2]
-    title: PrintableText = ""
+    title: section.PrintableText = ""
     note: str = ""
-    seed: Seed = 0
+    seed: section.Seed = 0
     scene: dict[str, Annotated[Any, OneOf("object")]] = {}
     scene_file: SceneFileTable | None = None
     room: AnyRoom | None = None
@@ -386,7 +379,7 @@ class _RunFile(Section):
     @property
     def fit_settings(self) -> fits.ReconstructTable:
         """The `[reconstruct]` table, which every fit needs."""
-        return require_section(self, "reconstruct", "reconstruct")
+        return section.require_section(self, "reconstruct", "reconstruct")
 
     @property
     def fitted_objects(self) -> list[str]:

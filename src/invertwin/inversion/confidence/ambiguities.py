@@ -15,8 +15,7 @@ from invertwin.inversion.confidence.realisations import FitResult, zscore
 from invertwin.inversion.fit import Fit
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.metrics import pose_error, sample_surface
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.parameters import Pose
+from invertwin.scene import Mesh, Pose
 from invertwin.scene.remeshing import closest_points
 from invertwin.scene.scene import Object, Scene, displace
 

@@ -15,14 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from invertwin.capture.backprojection import backproject
-from invertwin.capture.capture import Capture
+from invertwin.capture import Capture, backproject
 from invertwin.channel import Grid, Sampling
 from invertwin.checks import ArrayLike, checked_number
 from invertwin.errors import InputError
-from invertwin.radar.processing.detection import ordered_statistics_cfar, peaks
-from invertwin.radar.radar import Radar
-from invertwin.radar.surrogate.surrogate import Surrogate, surrogate_spectrum
+from invertwin.radar import Radar, Surrogate, ordered_statistics_cfar, peaks, surrogate_spectrum
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import DensityGrid, Object, Scene, rigid, rotation_from_vector
 from invertwin.scene.shape_models.lattice import Lattice

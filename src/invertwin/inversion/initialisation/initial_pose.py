@@ -14,9 +14,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.initialisation import detections
 from invertwin.limits import Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
-from invertwin.scene.parameters import Scale
-from invertwin.scene.pose import rigid
-from invertwin.scene.scene import Scene
+from invertwin.scene import Scale, Scene, rigid
 
 # Wide enough for an error of a cell, narrow enough to distinguish front from back.
 _POSE_SURROGATE = Surrogate(range_width=1.0, angle_width=0.5)
