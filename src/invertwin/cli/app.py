@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 from invertwin import __version__
 from invertwin.cli import inputs
 from invertwin.cli import options as command_options
-from invertwin.cli.options import argument, option
+from invertwin.cli.options import FileArgument, ResumableOptions, argument, console, option
 from invertwin.cli.report import ReportTable, use_plain_style
 from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
@@ -62,15 +62,14 @@ class _CommandGroup(TyperGroup):
 _LEARN, _DATA, _RUN, _DEVELOP, _PLUGINS = "Begin", "Recordings", "Run files", "Develop", "Plugins"
 _PANELS = (_LEARN, _DATA, _RUN, _DEVELOP, _PLUGINS)
 _PLAIN: dict[str, Any] = {"pretty_exceptions_enable": False, "add_completion": False}
+_Command = Callable[..., None]
 app = typer.Typer(name="invertwin", cls=_CommandGroup, no_args_is_help=True, **_PLAIN)
 
 
-def _command_with(
-    kind: type, panel: str = _RUN
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def _command_with(kind: type, panel: str = _RUN) -> Callable[[_Command], _Command]:
     """Add a command whose options are the fields of a dataclass."""
 
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+    def decorate(function: _Command) -> _Command:
         return app.command(rich_help_panel=panel)(command_options.with_options(kind)(function))
 
     return decorate
@@ -94,13 +93,13 @@ def invertwin(
 
 
 @_command_with(command_options.RunOptions)
-def simulate(options: command_options.RunOptions, file: command_options.FileArgument) -> None:
+def simulate(options: command_options.RunOptions, file: FileArgument) -> None:
     """Simulate exact radar signals of a scene, and their spectra; or a coverage map."""
     runs = load_runs([file], options, "simulate", _simulate_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         run = runs[file.stem]
-        with prefix_file_errors(file), show_progress(command_options.console):
+        with prefix_file_errors(file), show_progress(console):
             if _simulates_coverage(run):
                 from invertwin.cli.commands.coverage import run_coverage
 
@@ -121,7 +120,7 @@ def _simulate_sections(run: Any) -> tuple[str, ...]:
 
 
 @_command_with(command_options.DatasetOptions)
-def dataset(options: command_options.DatasetOptions, file: command_options.FileArgument) -> None:
+def dataset(options: command_options.DatasetOptions, file: FileArgument) -> None:
     """Simulate a data set: many samples of a run file with other values each, and their labels."""
     runs = load_runs([file], options, "dataset", inputs.DATASET_SECTIONS)
     from invertwin.cli.commands import dataset as command
@@ -130,7 +129,7 @@ def dataset(options: command_options.DatasetOptions, file: command_options.FileA
     chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        with prefix_file_errors(file), show_progress(command_options.console):
+        with prefix_file_errors(file), show_progress(console):
             workers = options.workers or available_threads()
             return command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
 
@@ -138,13 +137,13 @@ def dataset(options: command_options.DatasetOptions, file: command_options.FileA
 
 
 @_command_with(command_options.FitOptions)
-def reconstruct(options: command_options.FitOptions, file: command_options.FileArgument) -> None:
+def reconstruct(options: command_options.FitOptions, file: FileArgument) -> None:
     """Fit the parameters of a scene to radar data."""
     _run_one_reconstruction(file, options, Path("out", file.stem))
 
 
-@_command_with(command_options.ResumableOptions)
-def plan(options: command_options.ResumableOptions, file: command_options.FileArgument) -> None:
+@_command_with(ResumableOptions)
+def plan(options: ResumableOptions, file: FileArgument) -> None:
     """State the error bars of a fit before anything is recorded, and rank positions to add."""
     runs = load_runs([file], options, "plan", ("radar", "data", "grid", "parameters"))
 
@@ -152,15 +151,13 @@ def plan(options: command_options.ResumableOptions, file: command_options.FileAr
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            return run_plan(runs[file.stem], folder, command_options.console), ""
+            return run_plan(runs[file.stem], folder, console), ""
 
     run_in_folder(options, Path("out", file.stem), work, runs)
 
 
 @app.command(rich_help_panel=_DEVELOP)
-def check(
-    file: command_options.FileArgument, backend: command_options.BackendOption = None
-) -> None:
+def check(file: FileArgument, backend: command_options.BackendOption = None) -> None:
     """Say how much memory and time a run file needs, without running it."""
     from invertwin.cli.run_file import load_run
 
@@ -171,7 +168,7 @@ def check(
     with prefix_file_errors(file):
         tables, line = run_check(run)
     print_tables(tables)
-    command_options.console.print(line, markup=False, soft_wrap=True)
+    console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command(rich_help_panel=_DEVELOP)
@@ -181,7 +178,7 @@ def convert(files: command_options.FilesArgument) -> None:
     from invertwin_convert import run_convert
 
     for line in run_convert(files):
-        command_options.console.print(line, markup=False, soft_wrap=True)
+        console.print(line, markup=False, soft_wrap=True)
 
 
 @app.command(rich_help_panel=_LEARN)
@@ -202,11 +199,11 @@ def new(
         out.write(text)
     command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
     call = shlex.join([*(["python"] if kind == "plugin" else ["invertwin", command]), str(path)])
-    command_options.console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
+    console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
 
 
-@_command_with(command_options.ResumableOptions, _LEARN)
-def demo(options: command_options.ResumableOptions) -> None:
+@_command_with(ResumableOptions, _LEARN)
+def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
     again = options.overwrite or (options.out is None and not options.resume)
@@ -248,13 +245,11 @@ def view(
     use_plain_style()
     from invertwin.cli.commands.view import run_view
 
-    run_view(target, command_options.console, host=host, port=port, token=token, record=record)
+    run_view(target, console, host=host, port=port, token=token, record=record)
 
 
-@_command_with(command_options.ResumableOptions, _DEVELOP)
-def gradcheck(
-    options: command_options.ResumableOptions, files: command_options.FilesArgument
-) -> None:
+@_command_with(ResumableOptions, _DEVELOP)
+def gradcheck(options: ResumableOptions, files: command_options.FilesArgument) -> None:
     """Compare automatic derivatives with central differences."""
     runs = load_runs(files, options, "gradcheck", _gradcheck_sections)
     from invertwin.cli.commands.gradcheck import run_gradcheck
@@ -271,8 +266,8 @@ def _gradcheck_sections(run: Any) -> tuple[str, ...]:
     return ("gradcheck",) if alone else ("gradcheck", "radar", "grid")
 
 
-@_command_with(command_options.ResumableOptions)
-def rcs(options: command_options.ResumableOptions, files: command_options.FilesArgument) -> None:
+@_command_with(ResumableOptions)
+def rcs(options: ResumableOptions, files: command_options.FilesArgument) -> None:
     """Compute radar signatures: cross-sections, range profiles, images."""
     runs = load_runs(files, options, "rcs", ("rcs",))
     from invertwin.cli.commands.rcs import run_rcs
@@ -302,7 +297,7 @@ def doctor(backend: command_options.BackendOption = None) -> None:
     from invertwin.runtime import doctor as machine
 
     report = machine.collect_report()
-    command_options.console.print(machine.render_report(report), markup=False, soft_wrap=True)
+    console.print(machine.render_report(report), markup=False, soft_wrap=True)
     if not report["ok"]:
         raise typer.Exit(1)
 
@@ -325,7 +320,7 @@ def _run_recording(
     inputs.require_recording(options)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        with show_progress(command_options.console):
+        with show_progress(console):
             if isinstance(options, command_options.TwinOptions):
                 from invertwin.cli.commands.twin import run_twin
 
@@ -337,9 +332,7 @@ def _run_recording(
     run_in_folder(options, Path("out", options.recording.name.split(".")[0] + ending), work)
 
 
-def _run_one_reconstruction(
-    file: Path, options: command_options.ResumableOptions, default: Path
-) -> None:
+def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:
     runs = load_runs([file], options, "reconstruct", _reconstruct_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -351,9 +344,7 @@ def _run_one_reconstruction(
             workers = FitWorkers.from_options(options.engine, options.workers)
             view = options.view
         with prefix_file_errors(file):
-            return run_reconstruct(
-                runs[file.stem], folder, command_options.console, workers, view=view
-            )
+            return run_reconstruct(runs[file.stem], folder, console, workers, view=view)
 
     run_in_folder(options, default, work, runs)
 
