@@ -120,15 +120,17 @@ class SensorSetup:
     capture: Capture | None = None
 
 
-def estimate_resources(
-    run: RunFile, truth: Scene, sensors: Mapping[str, SensorSetup]
-) -> ResourceEstimate:
+Sensors = Mapping[str, SensorSetup]
+"""Sensors by name; a run without `[observations]` has one without a name."""
+
+
+def estimate_resources(run: RunFile, truth: Scene, sensors: Sensors) -> ResourceEstimate:
     """Estimate the resources of a run from its tables and their objects, without tracing.
 
     Args:
         run: The run file.
         truth: Its true scene.
-        sensors: Sensors by name; a run without `[observations]` has one without a name.
+        sensors: What records it.
 
     Raises:
         InputError: Too many starts, or a stage that makes too many triangles.
@@ -170,7 +172,7 @@ def estimate_rcs_resources(run: RunFile, scene: Scene) -> ResourceEstimate:
     return ResourceEstimate(ordered, 0, 0, "rcs.frequencies", 0, 0)
 
 
-def require_resources(run: RunFile, truth: Scene, sensors: Mapping[str, SensorSetup]) -> None:
+def require_resources(run: RunFile, truth: Scene, sensors: Sensors) -> None:
     """Refuse a run that this machine cannot do; arguments and errors as of `estimate_resources`."""
     for sensor in sensors.values():
         warn_if_purely_specular(truth, sensor.radar.waveform.center_frequency)
@@ -251,7 +253,7 @@ def _simulation_items(
         yield MemoryItem(name, drawn, each, "data.rough_paths"), drawn * (1 + kept)
 
 
-def _fit_items(run: RunFile, sensors: Mapping[str, SensorSetup]) -> Iterator[MemoryItem]:
+def _fit_items(run: RunFile, sensors: Sensors) -> Iterator[MemoryItem]:
     """Return the memory of fits and derivative checks, beside the data."""
     copies = (run.starts.count if run.starts else 1) * (1 + len(run.variants))
     key = "starts.count" if run.starts else "variants"
@@ -322,9 +324,7 @@ def _farthest_range(sensor: SensorSetup) -> float:
     return float(sensor.grid.ranges.abs().max()) + shift + spread / 2
 
 
-def _check_starts_and_stages(
-    run: RunFile, scene: Scene, sensors: Mapping[str, SensorSetup]
-) -> None:
+def _check_starts_and_stages(run: RunFile, scene: Scene, sensors: Sensors) -> None:
     """Refuse starts and stages beyond the limits of what makes them, before any of them begins."""
     chance = torch.Generator()
     for section, more in (("starts", {"generator": chance}), ("search", {})):

@@ -1,7 +1,7 @@
 """`invertwin check`: memory and time that a run file needs, before it runs."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +12,7 @@ from invertwin.channel import Sampling
 from invertwin.channel.sampling import resolve_densities
 from invertwin.cli import estimate
 from invertwin.cli.commands.gradcheck import checked_map
-from invertwin.cli.estimate import ResourceEstimate, SensorSetup
+from invertwin.cli.estimate import ResourceEstimate, Sensors, SensorSetup
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
 from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import make_observations, make_schedule
@@ -169,7 +169,7 @@ def _mesh_table(scene: Scene) -> ReportTable:
     return ReportTable("Meshes", heads, rows)
 
 
-def _build_sensors(run: RunFile) -> Mapping[str, SensorSetup]:
+def _build_sensors(run: RunFile) -> Sensors:
     mover = isinstance(next(iter(run.parameters), None), MovingTargetParameter)
     if run.task in _FIT_TASKS and not mover:
         return build_sensors(run)
@@ -182,7 +182,7 @@ def _build_sensors(run: RunFile) -> Mapping[str, SensorSetup]:
 
 
 def _estimate_seconds(
-    run: RunFile, found: ResourceEstimate, truth: Scene, sensors: Mapping[str, SensorSetup]
+    run: RunFile, found: ResourceEstimate, truth: Scene, sensors: Sensors
 ) -> float:
     """Estimate the time of the run from a few rays and a few paths on this machine."""
     whole, settings = next(iter(sensors.values())), run.gradcheck or run.reconstruct

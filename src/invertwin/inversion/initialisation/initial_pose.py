@@ -99,14 +99,11 @@ class InitialPoseEstimator:
         """
         if self.low is None or self.high is None:
             return InitialEstimate(scene)
+        where = capture, grid, self.low, self.high
         if self.method == "points":
-            points = detections.detect_echoes(
-                capture, grid, self.low, self.high, false_alarm=self.false_alarm
-            )
+            points = detections.detect_echoes(*where, false_alarm=self.false_alarm)
         else:
-            points = detections.find_bright_nodes(
-                capture, grid, self.low, self.high, step=self.step
-            )
+            points = detections.find_bright_nodes(*where, step=self.step)
         points = detections.find_largest_group(points, self.gap)
         item, radar = scene[name], capture.radar()
         if self.pose == "position":
