@@ -32,6 +32,7 @@ from invertwin.radar import FMCW, Radar
 from invertwin.radar.waveform import Waveform
 from invertwin.scene import (
     AntennaArray,
+    BodyTemplate,
     Isotropic,
     Material,
     Mesh,
@@ -41,6 +42,7 @@ from invertwin.scene import (
     Scene,
     Translation,
     linear_array,
+    person,
     plate,
 )
 
@@ -56,7 +58,7 @@ NUMBERS = (
 FILLS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308)
 TEXTS = ("", "\0", "\n", "ü" * 300, "a" * 100_000)
 #: Those without arguments of which plain ones can be made: modules, functions, bodies, files.
-UNSWEPT_MOST = 20
+UNSWEPT_MOST = 17
 SERVERS = ("Viewer", "InteractiveSensor")  # would listen on a port for each value
 
 
@@ -112,6 +114,8 @@ def plain(hint: Any) -> Any:
     simple = {float: 1.0, int: 2, str: "x", bool: False, type(None): None, Tensor: torch.ones(3)}
     if hint in simple:
         return simple[hint]
+    if hint is BodyTemplate:
+        return person(spacing=0.05)
     if inspect.isclass(hint) and hint.__module__.startswith("invertwin."):
         try:
             return build(hint, {})

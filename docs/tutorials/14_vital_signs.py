@@ -8,8 +8,8 @@
 # %matplotlib inline
 import math
 
-import matplotlib.pyplot as plt
 import torch
+from matplotlib.figure import Figure
 
 import invertwin as iw
 from invertwin.channel import draw_speckle
@@ -22,8 +22,8 @@ from invertwin.scene import Breathing, MovingScene, person, standing_height
 # lies in a lobe.
 
 # %%
-body = person(spacing=0.04)
-skin = iw.RoughDielectric(permittivity=8.0, diffuse=0.2, lobe_width=math.radians(15.0))
+body = person(spacing=0.03)
+skin = iw.RoughDielectric(permittivity=8.0, diffuse=0.2, lobe_width=math.radians(20.0))
 place = iw.rigid(translation=[1.5, 0.0, standing_height(body)])
 scene = iw.Scene({"person": iw.Object(body.mesh({}), skin, place)})
 truth = Breathing(body, rate=0.27, depth=8e-3, heart_rate=1.15, heart_depth=4e-4)
@@ -55,9 +55,6 @@ beat = beat + 0.1 * beat.abs().square().mean().sqrt() * torch.randn(
 frames = radar.frames([0] * train.count)  # the radar rests: each chirp is a frame from one place
 profile = range_profile(beat[0], frames, grid)
 seen = estimate_vital_signs(profile, radar, grid, interval=train.interval)
-plt.plot(seen.times, 1e3 * seen.displacement)
-plt.xlabel("time [s]")
-plt.ylabel("displacement towards the radar [mm]")
 breathing, heart = seen.breathing, seen.heart
 assert breathing
 assert heart
@@ -65,6 +62,10 @@ print(f"breathing {breathing.frequency:.3f} Hz, {1e3 * breathing.depth:.1f} mm")
 print(f"heart     {heart.frequency:.3f} Hz, {1e3 * heart.depth:.2f} mm")
 assert abs(breathing.frequency - truth.rate) < 0.01
 assert abs(heart.frequency - truth.heart_rate) < 0.03
+figure = Figure(figsize=(7, 3), layout="constrained")
+axes = figure.add_subplot(xlabel="time [s]", ylabel="towards the radar [mm]")
+axes.plot(seen.times, 1e3 * seen.displacement)
+figure
 
 # %% [markdown]
 # ## The depth by a fit through the simulation
@@ -89,7 +90,7 @@ def simulate_depth(depth: torch.Tensor, seed: int) -> tuple[torch.Tensor, float]
     profile = torch.stack([range_profile(shot.beat, radar, grid)[0, 0, 0] for shot in shots])
     moved, roundness, variance = estimate_displacement(profile, radar)
     best = int((roundness * variance).argmax())
-    return -4 * (moved[:, best] * torch.cos(2 * torch.pi * share)).mean(), float(roundness[best])
+    return -4 * (moved[:, best] * torch.cos(2 * torch.pi * share)).mean(), float(roundness[best].detach())
 
 
 depth = torch.tensor(5e-3, dtype=torch.float64, requires_grad=True)

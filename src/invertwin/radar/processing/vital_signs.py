@@ -28,6 +28,7 @@ _FALSE_ALARM = 0.01  # probability that noise counts as an oscillation
 _LEAST_ROUNDNESS = (
     8.0  # of the samples about their circle, see estimate_displacement; noise has 4.7
 )
+_TINY = 1e-300  # for bins without echoes
 _PADDING = 64  # frequencies for each that the duration resolves
 
 
@@ -126,14 +127,15 @@ def estimate_displacement(
         over that of their distances from the centre; and this variance of the samples.
     """
     samples = profile.to(torch.complex128)
-    columns = torch.stack([samples.real, samples.imag, torch.ones_like(samples.real)], 2)
-    square = samples.abs().square()
-    halves = torch.linalg.lstsq(columns.movedim(1, 0), square.T[:, :, None]).solution[:, :2, 0] / 2
-    away = samples - torch.view_as_complex(halves.contiguous())
+    off = samples - samples.mean(0)
+    x, y, square = off.real, off.imag, off.abs().square()
+    xx, yy, xy, xs, ys = (part.mean(0) for part in (x * x, y * y, x * y, x * square, y * square))
+    twice = 2 * (xx * yy - xy * xy).clamp_min(_TINY)
+    away = off - torch.complex((yy * xs - xy * ys) / twice, (xx * ys - xy * xs) / twice)
     phase = (away[1:] * away[:-1].conj()).angle().cumsum(0)
     phase = torch.cat([torch.zeros_like(phase[:1]), phase])
-    variance = (samples - samples.mean(0)).abs().square().mean(0)
-    roundness = variance / away.abs().var(0, correction=0)
+    variance = square.mean(0)
+    roundness = variance / away.abs().var(0, correction=0).clamp_min(_TINY)
     return -phase * radar.waveform.wavelength / (4 * math.pi), roundness, variance
 
 
