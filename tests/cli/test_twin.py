@@ -1,6 +1,9 @@
 """`invertwin twin`: files, tables, and what it refuses."""
 
 import json
+import os
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -113,6 +116,61 @@ def test_what_is_found_can_be_fitted_on(tmp_path: Path, monkeypatch, capsys):
     assert other["position_m"] == pytest.approx(thing["position_m"], abs=1e-3)
     described = tomllib.loads((folder / "twin.toml").read_text())
     assert described["data"]["file"] == "capture.nc"
+
+
+@pytest.mark.slow
+def test_stopped_in_the_search_then_resumed_finds_the_same(tmp_path: Path, monkeypatch):
+    """On one thread: two threads add paths in a varying order."""
+    (tmp_path / "box.toml").write_text(RUN.replace("rays = 1500", "rays = 400"))
+    monkeypatch.chdir(tmp_path)
+    # A signal as from Ctrl-C comes at the beginning of the third fit, in mid-search.
+    code = """
+import signal, sys
+from invertwin.cli.app import main
+from invertwin.discovery.assembly import ShapeLikelihood
+fit, count = ShapeLikelihood.fit, 0
+def counted(self, shapes, steps):
+    global count
+    count += 1
+    if count == 3:
+        signal.raise_signal(signal.SIGINT)
+    return fit(self, shapes, steps)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if sys.argv.pop() == "stop":
+    ShapeLikelihood.fit = counted
+main()
+"""
+    one = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+
+    def run(out: str, *more: str, ending: str = "go") -> subprocess.CompletedProcess[str]:
+        words = ["twin", "box.toml", "-o", out, *more, ending]
+        call = [sys.executable, "-c", code, *words]
+        return subprocess.run(call, env=os.environ | one, capture_output=True, text=True)
+
+    cut = run("cut", ending="stop")
+    assert cut.returncode == 130, cut.stderr
+    assert cut.stderr.startswith("invertwin: interrupted; the same command with --resume goes on")
+    assert "so far" in cut.stdout
+    kept = tmp_path / "cut" / "unfinished"
+    metrics = json.loads((kept / "metrics.json").read_text())
+    assert metrics["stopped"]
+    assert metrics["answer"].split(";")[0].endswith("so far, 0 doubtful")
+    (thing,) = metrics["things"]
+    assert thing["position_m"][:2] == pytest.approx([0.2, 0.1], abs=0.05)
+    assert thing["deviations"] == {}
+    assert "the search was stopped" in (kept / "report.html").read_text()
+    assert load_run(kept / "twin.toml").scene["object_1"].position == thing["position_m"]
+    assert not (tmp_path / "cut" / "metrics.json").exists()
+
+    other = run("cut", "--resume", "--rays", "1300")
+    assert other.returncode == 2
+    assert "expected a checkpoint of this search" in other.stderr
+    assert run("cut", "--resume").returncode == run("whole").returncode == 0
+    resumed, whole = (
+        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("cut", "whole")
+    )
+    assert not resumed["stopped"]
+    assert resumed["things"] == whole["things"]
 
 
 def test_noise_has_nothing_in_it(tmp_path: Path, monkeypatch, capsys):

@@ -110,6 +110,9 @@ class RunOptions(OutputOptions):
     backend: BackendOption = None
 
 
+ResumeOption = Annotated[bool, typer.Option("--resume")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ResumableOptions(RunOptions):
     """Options of commands that resume interrupted work.
@@ -118,7 +121,7 @@ class ResumableOptions(RunOptions):
         resume: Go on with an interrupted run in the folder.
     """
 
-    resume: Annotated[bool, typer.Option("--resume")] = False
+    resume: ResumeOption = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +187,8 @@ class RecordingOptions(OutputOptions):
         words, hints = [name], get_type_hints(type(self), include_extras=True)
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name in ("out", "overwrite", "backend") or value in (field.default, None):
+            unsaid = field.name in ("out", "overwrite", "backend", "resume")
+            if unsaid or value in (field.default, None):
                 continue
             kind = next(iter(getattr(hints[field.name], "__metadata__", ())), typer.Option())
             # Typer's first argument is a name, too, within an annotation.
@@ -237,6 +241,7 @@ class TwinOptions(RecordingOptions):
         height: Above the ground, where echoes are looked for, m; default: the radars'.
         rays: Of every frame in fits; default: 2000.
         seed: Of rays; default: 0.
+        resume: Go on with an interrupted run in the folder.
     """
 
     low: tuple[float, float] | None = None
@@ -247,6 +252,7 @@ class TwinOptions(RecordingOptions):
     rays: Annotated[int | None, typer.Option(min=100)] = None
     seed: SeedOption = None
     backend: BackendOption = None
+    resume: ResumeOption = False
 
 
 def _add_help(field: inspect.Parameter, text: str | None) -> inspect.Parameter:

@@ -1,7 +1,7 @@
 """Scenes of simple shapes: their likelihood for recorded maps, and their joint fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from invertwin.channel import Grid, Sampling
 from invertwin.discovery.imaging.likelihood import HeavyTailedLoss
 from invertwin.discovery.imaging.reflectivity import thin_map
+from invertwin.discovery.memory import SearchMemory
 from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
 from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
@@ -50,6 +51,7 @@ class ShapeLikelihood:
         bins_per_draw: number of correlated bins per independent draw.
         level: height of the ground [m].
         seed: seed of the rays.
+        memory: results of the search.
     """
 
     model: SurrogateMap
@@ -59,6 +61,7 @@ class ShapeLikelihood:
     bins_per_draw: float
     level: float
     seed: int
+    memory: SearchMemory = field(default_factory=SearchMemory)
 
     def unknowns(self, shapes: Shapes) -> dict[str, PrimitiveModel | OutlineModel]:
         """Return the shape models of shapes by name.
@@ -113,8 +116,17 @@ class ShapeLikelihood:
         Returns:
             Log-likelihood ratios [frame], scaled to independent draws.
         """
-        rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
-        return rows.flatten(1).double().sum(1) / self.bins_per_draw
+
+        def compute() -> Tensor:
+            rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
+            return rows.flatten(1).double().sum(1) / self.bins_per_draw
+
+        return self.memory.recall(self.gains_name, shapes, compute)
+
+    @property
+    def gains_name(self) -> str:
+        """Name of the gains in the memory; the selected frames have another one than all."""
+        return f"gains of {self.radar.frame_count} frames"
 
     def total_gain(self, shapes: Shapes) -> float:
         """Sum of ``log_likelihood_gains`` over the frames."""
@@ -153,11 +165,21 @@ class ShapeLikelihood:
         free, data = self.unknowns(shapes), Observation(self.model, self.power, sensor=self.radar)
         plan, loss, seed = Schedule(steps, annealing=0.5), self.loss, self.seed
         done = track(range(steps + 1), f"steps of a fit of {len(shapes)} objects")
-        told = [Report(lambda _: next(done, None))]
+        told = [Report(lambda _: (self.memory.heed(), next(done, None)))]
         found = reconstruct(
             scene, data, free, loss=loss, optimizer=adam, schedule=plan, seed=seed, callbacks=told
         )
         return [one.shape for one in free.values()], found
+
+    def refine(self, shapes: Shapes, steps: int) -> list[ShapeParameters]:
+        """Return the shapes of ``fit``.
+
+        Args:
+            shapes: initial shape parameters.
+            steps: number of steps.
+        """
+        name = f"{steps} steps on {self.radar.frame_count} frames"
+        return list(self.memory.recall(name, shapes, lambda: self.fit(shapes, steps)[0]))
 
 
 def make_sampling(frames: int, rays: int) -> Sampling:

@@ -110,7 +110,7 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
     for changed in (*propose_kinds(likelihood, shapes), rotate_headed_shapes(shapes, math.pi)):
         if not changed:
             continue
-        fitted, _ = likelihood.fit(changed, _SHORT_FIT_STEPS)
+        fitted = likelihood.refine(changed, _SHORT_FIT_STEPS)
         for number, (start, new, old) in enumerate(zip(changed, fitted, shapes, strict=True)):
             if start is old:
                 continue

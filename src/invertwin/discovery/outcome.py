@@ -94,13 +94,9 @@ class DetectedObject:
             "deviations": dict(self.deviations),
         }
         if self.shape is not None:
-            found |= {
-                "yaw_rad": self.shape.yaw,
-                "length_m": self.shape.length,
-                "width_m": self.shape.width,
-                "height_m": self.shape.height,
-                "brightness": self.shape.brightness,
-            }
+            sides = ("length", "width", "height")
+            found |= {f"{side}_m": getattr(self.shape, side) for side in sides}
+            found |= {"yaw_rad": self.shape.yaw, "brightness": self.shape.brightness}
         if self.velocity is not None:
             found["velocity_m_s"] = self.velocity.tolist()
         if self.track is not None:
@@ -137,6 +133,7 @@ class Twin:
         grid: bins of the maps.
         notes: remarks on the search.
         calibration: channel calibration estimated from the scene itself, applied to the maps.
+        stopped: whether Ctrl-C ended the search: the likeliest objects so far, without error bars.
     """
 
     objects: tuple[DetectedObject, ...]
@@ -147,6 +144,7 @@ class Twin:
     grid: Grid | None = None
     notes: tuple[str, ...] = ()
     calibration: ChannelCalibration | None = None
+    stopped: bool = False
 
     @property
     def scene(self) -> Scene | None:

@@ -1,8 +1,9 @@
 """Automatic reconstruction of a recording, without an initial guess."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -25,7 +26,8 @@ from invertwin.discovery.shapes.outlines import fit_outlines
 from invertwin.discovery.shapes.primitives import Shapes, shape_center
 from invertwin.discovery.tracks import track_moving_targets
 from invertwin.errors import InputError
-from invertwin.inversion import Reconstruction
+from invertwin.inversion.callbacks import defer_interrupt
+from invertwin.inversion.fingerprint import Fingerprint
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.aperture import aperture
@@ -50,6 +52,7 @@ def twin(
     height: float | None = None,
     rays: int = 2000,
     seed: int = 0,
+    checkpoint: str | Path | None = None,
 ) -> Twin:
     """Reconstruct the objects in a recording without an initial guess, with uncertainties.
 
@@ -71,9 +74,13 @@ def twin(
             objects.
         rays: number of rays per frame in fits.
         seed: seed of the rays.
+        checkpoint: file of a search that is interrupted. Ctrl-C in the search of shapes then
+            writes it and returns the likeliest objects so far; where it exists, the search goes
+            on from it. A second Ctrl-C ends at once.
 
     Raises:
-        InputError: A region invisible to all radars, or too large for its resolution.
+        InputError: A region invisible to all radars, or too large for its resolution; a checkpoint
+            of another search.
     """
     checked_count(rays, "rays", 100)
     if isinstance(recording, ChirpCapture):
@@ -108,7 +115,9 @@ def twin(
         found, image = point_detections.locate_coherent_points(capture, places, separation)
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
-    still = _find_static_objects(capture, radar.grid(*reach), floor, places, step, rays, seed)
+    search, one = _prepare_search(capture, radar.grid(*reach), floor, places, step, rays, seed)
+    kept = None if checkpoint is None else Path(checkpoint)
+    still = _find_static_objects(capture, search, one, places, kept)
     notes = () if gains is None else (_NOTES["calibration"].format(phase_spread(gains, radar)),)
     resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
     objects = _sort_objects([*resting, *moving])
@@ -155,48 +164,75 @@ def _find_moving_targets(
 _NOTES = read_table("invertwin.discovery", "notes.toml")
 
 
-def _find_static_objects(
+def _prepare_search(
     capture: Capture, grid: Grid, level: float, positions: Tensor, step: float, rays: int, seed: int
-) -> Twin:
-    """Find the shapes that fit the maps of a recording."""
+) -> tuple[ShapeSearch, ShapeLikelihood]:
+    """Return the search of a recording, and the likelihood of all its frames."""
     power = capture.spectrum(grid).detach().float()
     radar, frames = capture.radar(), capture.frame_count
     model = SurrogateMap(grid, sampling=make_sampling(frames, rays))
-    level_of_bins = _estimate_background(power, radar, grid)
-    loss, draw = (
-        likelihoods.HeavyTailedLoss(level_of_bins),
-        likelihoods.count_bins_per_draw(likelihoods.map_axes(radar, grid)),
-    )
+    loss = likelihoods.HeavyTailedLoss(_estimate_background(power, radar, grid))
+    draw = likelihoods.count_bins_per_draw(likelihoods.map_axes(radar, grid))
     one = ShapeLikelihood(model, radar, power, loss, draw, level, seed)
     held = list(range(_HELD_OUT_EVERY - 1, frames, _HELD_OUT_EVERY))
     held = held if frames >= 2 * _HELD_OUT_EVERY else []
     fitted = one.select_frames([k for k in range(frames) if k not in held]) if held else one
-    coarse = fitted.coarse_maps.grid
-    flat = positions[:, :2]
-    height = float(positions[:, 2].mean()) - level
-    response = compute_response(fitted.radar, coarse, positions)
-    lattice = ImageGrid(flat, step, response, max(height, 0.1))
-    aside = one.select_frames(held) if held else None
-    search = ShapeSearch(fitted, aside, lattice)
-    picture = search.first_image
+    response = compute_response(fitted.radar, fitted.coarse_maps.grid, positions)
+    height = max(float(positions[:, 2].mean()) - level, 0.1)
+    lattice = ImageGrid(positions[:, :2], step, response, height)
+    return ShapeSearch(fitted, one.select_frames(held) if held else None, lattice), one
+
+
+def _find_static_objects(
+    capture: Capture,
+    search: ShapeSearch,
+    one: ShapeLikelihood,
+    positions: Tensor,
+    checkpoint: Path | None,
+) -> Twin:
+    """Find the shapes that fit the maps of a recording, or until Ctrl-C the likeliest so far."""
+    memory, sampling = one.memory, one.model.sampling
+    told = Fingerprint(one.power, one.level, one.seed, sampling, positions)
+    if checkpoint is not None and checkpoint.exists():
+        memory.load(checkpoint, told)
+    try:
+        with defer_interrupt() as memory.heed:
+            shapes, objects, notes = _search_shapes(capture, search, one, positions)
+        stopped = False
+    except KeyboardInterrupt:
+        if checkpoint is None:
+            raise
+        memory.heed, stopped = lambda: None, True
+        memory.save(checkpoint, told)
+        shapes, notes = search.best_so_far(), (_NOTES["stopped"],)
+        sole = [[certainty.ShapeHypothesis(shape, 1.0)] for shape in shapes]
+        objects = _describe_objects(one, {}, shapes, sole)
+    scene, grid = one.build_scene(shapes) if shapes else None, one.model.grid
+    views = _count_views(one.radar, positions, scene)
+    seen = GroundImage(positions[:, :2], search.first_image, views)
+    predicted = one.predict(shapes) + one.loss.level[:, None, None].to(one.power)
+    return Twin(objects, one.level, seen, predicted, one.power, grid, notes, stopped=stopped)
+
+
+def _search_shapes(
+    capture: Capture, search: ShapeSearch, one: ShapeLikelihood, positions: Tensor
+) -> tuple[Shapes, tuple[DetectedObject, ...], tuple[str, ...]]:
+    """Search for shapes; return them, the objects that they are, and remarks."""
+    fitted, aside, grid = search.fitted_frames, search.held_out_frames, one.model.grid
     shapes, points = search.run(), tuple(point_detections.detect_static_points(capture, grid))
-    if frames == 1:
+    if capture.frame_count == 1:
         # Of one view a blurred echo has many outlines: the search may end in a wrong one.
         spheres = search.fit_spheres(one.position for one in points)
         shapes = max(shapes, spheres, key=search.evidence)
-    level_map = one.loss.level[:, None, None].to(power)
     if not shapes:
-        seen = GroundImage(flat, picture, _count_views(radar, positions, None))
-        nothing = level_map.expand_as(power)
-        nothing_found = "nothing" + _relate_to_noise(power, radar, grid)[2]
-        notes = (_NOTES["no_shape"] if points else nothing_found,)
-        return Twin(points, level, seen, nothing, power, grid, notes)
+        nothing_found = "nothing" + _relate_to_noise(one.power, one.radar, grid)[2]
+        return [], points, (_NOTES["no_shape"] if points else nothing_found,)
     notes = ()
     if aside is not None:
         shapes = fit_outlines(fitted, aside, shapes)
-        seen_there = compute_response(aside.radar, coarse, positions)
         there = aside.coarse_maps
-        powers = torch.zeros_like(there.power), seen_there.predict_maps(picture)
+        seen_there = compute_response(aside.radar, there.grid, positions)
+        powers = torch.zeros_like(there.power), seen_there.predict_maps(search.first_image)
         nothing, image = (there.loss.bin_losses(power, there.power) for power in powers)
         gain = float((nothing - image).sum()) / likelihoods.count_bins_per_draw(
             likelihoods.map_axes(aside.radar, there.grid)
@@ -209,25 +245,23 @@ def _find_static_objects(
     if any(new is not old for new, old in zip(likelier, shapes, strict=True)):
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = certainty.find_hypotheses(one, shapes)
-    objects = _describe_objects(one, found, shapes, among)
-    seen = GroundImage(flat, picture, _count_views(radar, positions, one.build_scene(shapes)))
-    return Twin(objects, level, seen, one.predict(shapes) + level_map, power, grid, notes)
+    errors = certainty.standard_deviations(one, found)
+    return shapes, _describe_objects(one, errors, shapes, among), notes
 
 
 def _describe_objects(
     likelihood: ShapeLikelihood,
-    fit: Reconstruction,
+    errors: Mapping[str, float],
     shapes: Shapes,
     among: Sequence[certainty.Hypotheses],
 ) -> tuple[DetectedObject, ...]:
     """Return fitted shapes as objects with error bars, kinds and existence probabilities."""
-    errors = certainty.standard_deviations(likelihood, fit)
     found, present = [], certainty.existence_probabilities(likelihood, shapes)
     for k, (shape, own, probability) in enumerate(zip(shapes, among, present, strict=True), 1):
         name, kinds, start = f"object_{k}", certainty.kind_probabilities(own), f"object_{k}."
         center = shape_center(shape, likelihood.level)
         mine = {n.removeprefix(start): v for n, v in errors.items() if n.startswith(start)}
-        wide = certainty.widen_deviations(likelihood, mine, own)
+        wide = certainty.widen_deviations(likelihood, mine, own) if mine else {}
         kind = shape.effective_kind
         found.append(DetectedObject(name, kind, kinds, center, shape, wide, probability))
     return tuple(found)

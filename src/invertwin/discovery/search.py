@@ -13,12 +13,8 @@ from torch import Tensor
 from invertwin.discovery import proposals
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.imaging.reflectivity import ImageResponse, reconstruct_reflectivity
-from invertwin.discovery.shapes.primitives import (
-    ShapeParameters,
-    Shapes,
-    corner_direction,
-    rotate_shape,
-)
+from invertwin.discovery.shapes import primitives
+from invertwin.discovery.shapes.primitives import ShapeParameters, Shapes, rotate_shape
 from invertwin.discovery.shapes.prisms import PrismParameters, prism_contour
 
 _MAX_SHAPES = 24  # maximum number of objects
@@ -52,15 +48,6 @@ class ImageGrid:
     height: float
 
 
-def count_parameters(shape: ShapeParameters) -> int:
-    """Return the number of free parameters of a shape.
-
-    Args:
-        shape: shape parameters.
-    """
-    return 7 if shape.is_rectangular else 5
-
-
 @dataclass(frozen=True, eq=False)
 class ShapeSearch:
     """Search for the shapes that fit maps.
@@ -87,7 +74,7 @@ class ShapeSearch:
         Args:
             shapes: candidate shapes.
         """
-        likelihood, count = self.fitted_frames, sum(count_parameters(shape) for shape in shapes)
+        likelihood, count = self.fitted_frames, sum(7 if s.is_rectangular else 5 for s in shapes)
         return likelihood.total_gain(shapes) - 0.5 * count * math.log(likelihood.independent_draws)
 
     def is_better(self, new: Shapes, old: Shapes) -> bool:
@@ -114,10 +101,20 @@ class ShapeSearch:
         Args:
             shapes: known shapes.
         """
-        coarse = self.fitted_frames.coarse_maps
-        predicted = self.fitted_frames.predict_coarse(shapes) + coarse.loss.level[:, None, None]
-        response, degrees = self.image_grid.response, coarse.loss.degrees
-        return reconstruct_reflectivity(response, coarse.power, predicted, degrees=degrees)
+
+        def compute() -> Tensor:
+            coarse = self.fitted_frames.coarse_maps
+            predicted = self.fitted_frames.predict_coarse(shapes) + coarse.loss.level[:, None, None]
+            response, degrees = self.image_grid.response, coarse.loss.degrees
+            return reconstruct_reflectivity(response, coarse.power, predicted, degrees=degrees)
+
+        return self.fitted_frames.memory.recall("image", shapes, compute)
+
+    def best_so_far(self) -> list[ShapeParameters]:
+        """Return the shapes of highest evidence of all evaluated ones; empty without any."""
+        likelihood = self.fitted_frames
+        seen = [s for name, s in likelihood.memory.results if name == likelihood.gains_name]
+        return list(max(seen, key=self.evidence, default=()))
 
     def run(self) -> list[ShapeParameters]:
         """Run the search and return the shapes."""
@@ -133,7 +130,7 @@ class ShapeSearch:
             return []
         shapes = self.select_headings(self.select_kinds(shapes))
         shapes = self.split_shapes(self.merge_shapes(shapes))
-        shapes, _ = self.fitted_frames.fit(shapes, _LONG_FIT_STEPS)
+        shapes = self.fitted_frames.refine(shapes, _LONG_FIT_STEPS)
         return self.prune(self.refine(self.select_heights(shapes)))
 
     def fit_spheres(self, places: Iterable[Tensor]) -> list[ShapeParameters]:
@@ -197,7 +194,7 @@ class ShapeSearch:
         radars = likelihood.radar.positions.detach()[:, :2]
         direction = torch.nn.functional.normalize(radars[:, None] - grid.positions, dim=2)
         yaws = [k * math.pi / 8 for k in range(16)]
-        cosines = (direction @ corner_direction(yaw) for yaw in yaws)
+        cosines = (direction @ primitives.corner_direction(yaw) for yaw in yaws)
         score = torch.stack([((c > _MIN_CORNER_COSINE) * gain).sum(0) for c in cosines])
         found = list[ShapeParameters]()
         for _ in range(_CORNERS_PER_ROUND):
@@ -280,7 +277,7 @@ class ShapeSearch:
         Args:
             shapes: initial shapes.
         """
-        return self.fitted_frames.fit(shapes, _SHORT_FIT_STEPS)[0]
+        return self.fitted_frames.refine(shapes, _SHORT_FIT_STEPS)
 
     def prune(self, shapes: Shapes) -> list[ShapeParameters]:
         """Remove shapes without supporting evidence, the weakest first.

@@ -13,7 +13,7 @@ from invertwin.cli import report
 from invertwin.cli.commands.look import AnyRecording, read_recording, warning_tables
 from invertwin.cli.commands.view import load_display
 from invertwin.cli.exact_signals import simulate_exact
-from invertwin.cli.options import TwinOptions
+from invertwin.cli.options import TwinOptions, console
 from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.recordings import SimulatedData
@@ -24,6 +24,7 @@ from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
 from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mesh
+from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 from invertwin.viewer import view_html
 
@@ -51,7 +52,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
     else:
         _, recording = read_recording(arguments)
     faults = [str(fault) for fault in find_faults(recording)]
-    found = twin(recording, **options)
+    found = twin(recording, **options, checkpoint=folder.file(f"{PARTS}/search.json"))
     sure, answer = _state_objects(found)
     metrics: dict[str, Any] = {
         "task": "twin",
@@ -60,6 +61,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
         "count": sure,
         "unsure": len(found.objects) - sure,
         "notes": list(found.notes),
+        "stopped": found.stopped,
         "warnings": faults,
     }
     if found.image is not None:
@@ -98,7 +100,11 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
         arguments = replace(arguments, recording=own, config=None, board=None, **stated)
     # Else movers are in the chirps alone, which a capture does not keep.
     again = arguments.command("twin", folder.path)
-    return report.write_report(folder, metrics, title, f"{said}.", parts, again=again), answer
+    tables = report.write_report(folder, metrics, title, f"{said}.", parts, again=again)
+    if found.stopped:
+        console.print(f"{said}: {folder.file('report.html')}", markup=False, soft_wrap=True)
+        raise KeyboardInterrupt
+    return tables, answer
 
 
 def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, RunFile]:
@@ -120,10 +126,10 @@ def _state_objects(found: Twin) -> tuple[int, str]:
     likely = [x for x in found.objects if x.existence_probability > _MIN_EXISTENCE_PROBABILITY]
     sure = [one for one in likely if _position_deviation(one) <= limit]
     count = f"{len(sure)} object{'s' * (len(sure) != 1)} found"
-    said = [f"{count}, {len(found.objects) - len(sure)} doubtful"]
+    said = [f"{count}{' so far' * found.stopped}, {len(found.objects) - len(sure)} doubtful"]
     for thing in sure[:_MAX_STATED]:
         place, off = report.format_place(thing.position[:2].tolist()), _position_deviation(thing)
-        said.append(f"{thing.kind} at ({place}) ± {off:.2g} m")
+        said.append(f"{thing.kind} at ({place})" + (f" ± {off:.2g} m" if off else ""))
     said += [f"{len(sure) - _MAX_STATED} more"] if len(sure) > _MAX_STATED else []
     return len(sure), "; ".join(said)
 
