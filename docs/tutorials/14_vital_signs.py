@@ -90,7 +90,9 @@ def simulate_depth(depth: torch.Tensor, seed: int) -> tuple[torch.Tensor, float]
     profile = torch.stack([range_profile(shot.beat, radar, grid)[0, 0, 0] for shot in shots])
     moved, roundness, variance = estimate_displacement(profile, radar)
     best = int((roundness * variance).argmax())
-    return -4 * (moved[:, best] * torch.cos(2 * torch.pi * share)).mean(), float(roundness[best].detach())
+    return -4 * (moved[:, best] * torch.cos(2 * torch.pi * share)).mean(), float(
+        roundness[best].detach()
+    )
 
 
 depth = torch.tensor(5e-3, dtype=torch.float64, requires_grad=True)

@@ -16,13 +16,15 @@ import invertwin
 from cli.small import call, read_metrics
 from invertwin.capture.readers import described_arrays
 from invertwin.cli.commands.dataset import make_sample_run, make_shard
+from invertwin.cli.exact_signals import warn_if_aliased
 from invertwin.cli.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema import build
 from invertwin.cli.schema.shape_tables import joint_positions
 from invertwin.cli.schema.variation import parse_key_path, set_values
 from invertwin.datasets import SampleDataset, object_labels
 from invertwin.datasets.shards import locate_members
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
+from invertwin.radar import Chirps
 from invertwin.runtime.engines import run_jobs
 
 ANYWHERE = Path("rooms.toml")
@@ -249,6 +251,30 @@ def test_samples_hold_signals_and_true_labels(whole):
     assert present == {1, 2}
 
 
+def test_samples_hold_micro_doppler(tmp_path):
+    """The ball recedes with 1 m/s along x: its range rate is that times the cosine to x."""
+    text = RUN[: RUN.index("[dataset]")].replace("count = 4", "count = 64")
+    text = text.replace("interval = 6e-5", "interval = 4e-4")
+    (tmp_path / "ball.toml").write_text(
+        text + '[dataset]\nsamples = 1\nsignals = ["micro_doppler"]\n'
+    )
+    found = invertwin.dataset(tmp_path / "ball.toml", tmp_path / "out")
+    assert found.manifest.arrays["micro_doppler"].dims == ["frame", "time", "velocity"]
+    power = found[0]["micro_doppler"]
+    assert power.shape == (1, 25, 16)
+    limit = 299_792_458 / 77.5e9 / (4 * 4e-4)  # the last bin is one below it
+    rates = torch.linspace(-limit, limit, 17)[:-1]
+    assert rates[power[0].mean(0).argmax()] == pytest.approx(1.0, abs=limit / 8)
+
+
+def test_what_moves_beyond_the_limit_of_range_rates_is_told(tmp_path, monkeypatch, capsys):
+    run = validate_run(tomllib.loads(RUN), ANYWHERE)
+    scene, radar = build.true_scene(run), build.radar(run.radar)
+    with pytest.warns(PhysicsWarning, match=r"up to 1.00 m/s, beyond 0.97 m/s, and appears"):
+        warn_if_aliased(run, scene, radar, Chirps(64, 1e-3))
+    warn_if_aliased(run, scene, radar, Chirps(64, 0.9e-3))  # no warning: ±1.07 m/s
+
+
 def test_a_sample_is_simulated_again_from_its_own_run_file(whole, tmp_path, monkeypatch):
     found, _ = whole
     (tmp_path / "again.toml").write_text(found[3]["run"])
@@ -368,6 +394,13 @@ def varied(**table):
         (
             {**tomllib.loads(RUN), "dataset": {"samples": 2, "classes": {"bal": "x"}}},
             r"^dataset.classes.bal: .*did you mean `ball`",
+        ),
+        (
+            {
+                **{k: v for k, v in tomllib.loads(RUN).items() if k != "chirps"},
+                "dataset": {"samples": 2, "signals": ["micro_doppler"]},
+            },
+            r"^dataset.signals: expected \[chirps\] with micro_doppler",
         ),
         (
             {**tomllib.loads(RUN), "dataset": {"samples": 2, "paths": True}},

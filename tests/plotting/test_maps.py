@@ -9,7 +9,7 @@ from invertwin.channel import Grid
 from invertwin.errors import InputError
 from invertwin.plotting import MapPanel
 from invertwin.plotting.figures import png_bytes
-from invertwin.radar import DopplerMaps
+from invertwin.radar import DopplerMaps, Spectrogram
 from invertwin.radar.processing.doppler_maps import Peak
 
 GRID = Grid(1.0, 0.5, 3, -0.4, 0.2, 5, -0.1, 0.1, 3)
@@ -121,6 +121,17 @@ def test_range_doppler_shows_rates_and_directions(grid, titles):
         DopplerMaps(grid, rates, maps.range_doppler, everything, None, peak, None)
     )
     assert list(without)[1:] == titles[: len(titles) // 2]
+
+
+def test_a_spectrogram_has_times_across_and_range_rates_up():
+    power = torch.rand(5, 4, dtype=torch.float64, generator=torch.manual_seed(0)) + 0.1
+    rates = torch.tensor([-1.0, 0.0, 1.0, 2.0], dtype=torch.float64)
+    times = 1e-3 * torch.arange(1, 6, dtype=torch.float64)
+    (axes,) = cells(plotting.spectrogram(Spectrogram(power, times, rates)))
+    np.testing.assert_allclose(shown(axes), decibels(power.T / power.max()), rtol=1e-5)
+    assert axes.get_xlim() == pytest.approx((0.5, 5.5))  # ms
+    assert axes.get_ylim() == pytest.approx((-1.5, 2.5))
+    assert "range rate" in axes.get_ylabel()
 
 
 def test_derivatives_share_a_symmetric_scale():

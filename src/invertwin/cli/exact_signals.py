@@ -1,5 +1,6 @@
 """Exact signals with the settings of a run file: data of simulations and of fits of them."""
 
+import warnings
 from typing import Any
 
 import torch
@@ -8,10 +9,12 @@ from invertwin.channel import Grid, Sampling
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import Chirps, Radar
 from invertwin.scene import Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
+
+_INSTANTS = 9  # of a frame, at which range rates are compared with their limit
 
 
 def simulate_exact(run: RunFile, scene: Scene, radar: Radar, grid: Grid) -> Simulation:
@@ -35,10 +38,35 @@ def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirp
     front = sensors.impairments(run.impairments, data)
     table = require_section(run, "chirps", "several ramps a frame")
     depth = data.depth if data.mirrors else 1
+    warn_if_aliased(run, scene, radar, chirps)
     moving, how = build_moving_scene(run, scene), _settings(run, scene, depth)
     how |= {"retrace": table.retrace, "visibility_every": table.visibility_every}
     with prefix_errors("chirps"), torch.no_grad():
         return simulate_chirps(moving, radar, chirps, impairments=front, **how)
+
+
+def warn_if_aliased(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> None:
+    """Warn if a point, such as one of a limb, exceeds the largest unambiguous range rate."""
+    moving = build_moving_scene(run, scene)
+    motion = moving.advance if isinstance(moving, Scene) else moving
+    names = {name for name, thing in scene.objects.items() if thing.velocity is not None}
+    names |= set(getattr(moving, "motions", ()))
+    if not names:
+        return
+
+    def distances(time: float) -> torch.Tensor:
+        now = motion(time)
+        return torch.cdist(radar.positions, torch.cat([now[name].vertices for name in names]))
+
+    limit = chirps.max_speed(radar.waveform.wavelength, radar.shape[1])
+    loop = 0.25 * radar.waveform.wavelength / limit
+    starts = torch.linspace(0, (chirps.count - 1) * loop, _INSTANTS)[:-1].tolist()
+    with torch.no_grad():
+        fastest = max(float((distances(t + loop) - distances(t)).abs().max()) for t in starts)
+    if fastest > limit * loop:
+        text = f"chirps: what moves has range rates up to {fastest / loop:.2f} m/s, beyond "
+        text += f"{limit:.2f} m/s, and appears at others; shorten the interval of chirps"
+        warnings.warn(text, PhysicsWarning, stacklevel=2)
 
 
 def require_simulated_data(run: RunFile) -> SimulatedData:

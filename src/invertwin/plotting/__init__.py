@@ -28,6 +28,7 @@ from invertwin.plotting.maps import images as images
 from invertwin.plotting.maps import panels as panels
 from invertwin.plotting.maps import range_doppler as range_doppler
 from invertwin.plotting.maps import residuals as residuals
+from invertwin.plotting.maps import spectrogram as spectrogram
 from invertwin.plotting.maps import spectrum as spectrum
 from invertwin.plotting.rooms import floor_plan as floor_plan
 from invertwin.plotting.rooms import placements as placements

@@ -19,7 +19,7 @@ from invertwin.channel import Grid
 from invertwin.checks import check_shape, check_some
 from invertwin.inversion.confidence.realisations import coarsen_map
 from invertwin.plotting.figures import add_colorbar, label_axes, numbers, row_of_axes, signed_colors
-from invertwin.radar import DopplerMaps
+from invertwin.radar import DopplerMaps, Spectrogram
 
 U_LABEL, V_LABEL = "direction cosine u (to the left)", "direction cosine v (up)"
 RATE_LABEL = "range rate [m/s], away > 0"
@@ -95,6 +95,19 @@ def panels(maps: Mapping[str, MapPanel], *, dynamic_range: float = 40.0) -> Figu
 def range_doppler(maps: DopplerMaps) -> Figure:
     """Range × range rate of one frame, and range × direction: all echoes and moving targets."""
     return panels(doppler_panels(maps))
+
+
+def spectrogram(found: Spectrogram) -> Figure:
+    """Range rate over time of one frame, in dB below the peak.
+
+    Args:
+        found: Micro-Doppler, of `DopplerMaps`.
+    """
+    figure, (axes,) = row_of_axes(1, (6.4, 3.6))
+    power = MapPanel(found.power.T, found.velocities, 1e3 * found.times, "time [ms]")
+    _draw_decibels(figure, [(axes, "", power)], True, 40.0)
+    axes.set_ylabel(RATE_LABEL, fontsize=8)
+    return figure
 
 
 def doppler_panels(maps: DopplerMaps) -> dict[str, MapPanel]:
@@ -266,13 +279,11 @@ def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style
 
 def _add_degrees(cell: Any, name: str) -> None:
     """Add an axis of degrees above the axis of a direction cosine."""
-    scale = cell.secondary_xaxis(
-        "top",
-        functions=(
-            lambda cosine: np.rad2deg(np.arcsin(np.clip(cosine, -1, 1))),
-            lambda angle: np.sin(np.deg2rad(np.clip(angle, -90, 90))),
-        ),
+    ways = (
+        lambda cosine: np.rad2deg(np.arcsin(np.clip(cosine, -1, 1))),
+        lambda angle: np.sin(np.deg2rad(np.clip(angle, -90, 90))),
     )
+    scale = cell.secondary_xaxis("top", functions=ways)
     # Towards the rim degrees are so near to each other that their numbers would overlap.
     scale.xaxis.set_major_formatter(lambda angle, _: f"{angle:g}" if abs(angle) < 65 else "")
     scale.tick_params(labelsize=7, pad=1)

@@ -22,7 +22,7 @@ RESULTS = (
     *("manifest.json", "shard-*.tar", "view.npz"),
     *("channels.json", "points.*", "prior.npz", "train.log", "turntable.gif", folders.UNFINISHED),
     *("scene.png", "spectra*.png", "doppler.png", "loss*.png", "convergence.png", "landscape.png"),
-    *("look.png", "recording.png", "twin_*.png", "residuals*.png"),
+    *("look.png", "micro_doppler.png", "recording.png", "twin_*.png", "residuals*.png"),
 )
 
 

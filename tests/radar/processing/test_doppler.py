@@ -25,6 +25,7 @@ from invertwin.radar import (
     velocity_span,
 )
 from invertwin.radar.boards import BOARDS
+from invertwin.radar.processing.doppler import frame_spectrogram
 from invertwin.scene import (
     MovingScene,
     Object,
@@ -216,6 +217,22 @@ def test_spectrogram_follows_a_swinging_point():
     expected = 0.02 * 2 * math.pi * 5 * torch.cos(2 * math.pi * 5 * result.times)
     assert (ridge - expected).abs().max() < 1.5 * (result.velocities[1] - result.velocities[0])
     assert result.power.max() == pytest.approx(0.25, rel=0.1)
+
+
+def test_the_spectrogram_of_a_frame_has_no_static_echoes():
+    """A point that recedes with 4 m/s beside a static one of 900 times its power."""
+    radar, chirps, rate = mimo(2, 2), Chirps(64, 50e-6), 4.0
+    grid = radar.grid(3, 5)
+    beat = mover(radar, chirps, rate) + 30 * mover(radar, chirps, 0.0)
+    found = frame_spectrogram(beat, radar, grid, chirps)
+    assert found.power.shape == (1, 25, 16)
+    assert found.velocities[-1] - found.velocities[0] == pytest.approx(
+        15 / 16 * velocity_span(radar, chirps)
+    )
+    ridge = found.velocities[found.power[0].argmax(-1)]
+    assert (ridge - rate).abs().max() < found.velocities[1] - found.velocities[0]
+    with pytest.raises(InputError, match=r"window of 2\.\.8 chirps"):
+        frame_spectrogram(beat[:, :8], radar, grid, Chirps(8, 50e-6))
 
 
 def slow_time(beat: torch.Tensor, radar: Radar, chirps: Chirps, far: float) -> torch.Tensor:

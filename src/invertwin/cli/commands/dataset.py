@@ -16,7 +16,7 @@ import torch
 
 from invertwin import __version__, plotting
 from invertwin.cli.estimate import SensorSetup, require_resources
-from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact
+from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact, warn_if_aliased
 from invertwin.cli.inputs import DATASET_SECTIONS
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
@@ -25,7 +25,7 @@ from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_a
 from invertwin.cli.schema.variation import draw_sample
 from invertwin.datasets import SampleDataset, labels, shards
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.radar import range_doppler_angle
+from invertwin.radar.processing import doppler
 from invertwin.radar.radar import Radar
 from invertwin.registry.section import require_section
 from invertwin.runtime.engines import Engine, run_jobs
@@ -35,7 +35,8 @@ from invertwin.storage.folders import PARTS, UNFINISHED
 from invertwin.storage.run_folder import RunFolder, open_run
 
 _NUMERICAL_PACKAGES = ("drjit", "finufft", "mitsuba", "numpy", "torch")
-_ARRAY_NAMES = {"raw": "beat", "map": "map"}  # of arrays, by what the run file calls them
+# Names of arrays, by what the run file calls them.
+_ARRAY_NAMES = {"raw": "beat", "map": "map", "micro_doppler": "micro_doppler"}
 _FIELD_UNIT = "√(received over sent)"
 
 
@@ -132,6 +133,8 @@ def run_dataset(
     with prefix_file_errors(Path(f"sample {wanted[0][1]}")):
         scene, sensor = _build_sample(own)
         require_resources(own, scene, {"": sensor})
+        if own.chirps is not None:
+            warn_if_aliased(own, scene, sensor.radar, own.chirps.build())
     found = {number: _read_finished_shard(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
     text = to_toml(run)
@@ -153,15 +156,10 @@ def run_dataset(
     folder.write_text(shards.MANIFEST, manifest.model_dump_json(indent=1) + "\n")
     count, seconds = sum(shard.samples for shard in rows), time.perf_counter() - begin
     answer = f"{count} samples ({', '.join(content['arrays'])}) in {len(rows)} shards"
-    metrics = {
-        "task": "dataset",
-        "answer": answer,
-        "dataset_samples": count,
-        "shards": len(rows),
-        "dataset_bytes": sum(shard.size for shard in rows),
-        "samples_per_second": sum(made for _, _, made in missing) / seconds,
-        "wall_seconds": seconds,
-    }
+    metrics = {"task": "dataset", "answer": answer, "wall_seconds": seconds}
+    metrics |= {"dataset_samples": count, "shards": len(rows)}
+    metrics |= {"dataset_bytes": sum(shard.size for shard in rows)}
+    metrics |= {"samples_per_second": sum(made for _, _, made in missing) / seconds}
     view = save_picture(folder, "scene", plotting.scene(scene, sensor.radar), "The first sample")
     parts, title = [view, quantity_table("Data set", metrics)], run.title or "Data set"
     said, note = f"{answer}.", run.note
@@ -231,6 +229,7 @@ def _simulate_signals(
     run: RunFile, scene: Scene, sensor: SensorSetup, table: Any
 ) -> dict[str, np.ndarray]:
     """Simulate exact signals and the arrays derived from them, by name."""
+    moving = power = torch.zeros(0)
     if run.chirps is None:
         simulated = simulate_exact(run, scene, sensor.radar, sensor.grid)
         beat, power = simulated.beat, simulated.spectrum
@@ -239,11 +238,13 @@ def _simulate_signals(
     else:
         chirps = run.chirps.build()
         beat, more = simulate_chirp_beats(run, scene, sensor.radar, chirps), {}
-        power = torch.zeros(0)
         if "map" in table.signals:
-            power = range_doppler_angle(beat, sensor.radar, sensor.grid, chirps)
+            power = doppler.range_doppler_angle(beat, sensor.radar, sensor.grid, chirps)
+        if "micro_doppler" in table.signals:
+            moving = doppler.frame_spectrogram(beat, sensor.radar, sensor.grid, chirps).power
     found = {"raw": beat.resolve_conj().to(torch.complex64), "map": power.float()}
-    return {_ARRAY_NAMES[name]: found[name].numpy() for name in table.signals} | more
+    found["micro_doppler"] = moving.float()
+    return {_ARRAY_NAMES[n]: found[n].numpy() for n in table.signals} | more
 
 
 def _labelled_scene(run: RunFile, scene: Scene, radar: Radar) -> Scene:
@@ -261,13 +262,12 @@ def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
     known = {
         "beat": info(dims=["frame", *chirp, "tx", "rx", "sample"], unit=_FIELD_UNIT),
         "map": info(dims=["frame", *rate, "range", "u", "v"], unit="received over sent"),
+        "micro_doppler": info(dims=["frame", "time", "velocity"], unit="received over sent"),
         "masks": info(dims=["frame", "triangle"], unit="share that is seen"),
-        "paths_frame": info(dims=["path"], unit="number"),
-        "paths_delay": info(dims=["path"], unit="s"),
-        "paths_coefficient": info(dims=["path"], unit=_FIELD_UNIT),
-        "paths_first": info(dims=["path", "xyz"], unit="m"),
-        "paths_last": info(dims=["path", "xyz"], unit="m"),
     }
+    units = {"frame": "number", "delay": "s", "coefficient": _FIELD_UNIT}
+    known |= {f"paths_{name}": info(dims=["path"], unit=unit) for name, unit in units.items()}
+    known |= {f"paths_{end}": info(dims=["path", "xyz"], unit="m") for end in ("first", "last")}
     held = {_ARRAY_NAMES[name] for name in table.signals} | ({"masks"} if table.masks else set())
     return {n: a for n, a in known.items() if n in held or (table.paths and "paths_" in n)}
 

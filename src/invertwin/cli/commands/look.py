@@ -15,9 +15,10 @@ from invertwin import radar as radars
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid
 from invertwin.checks import checked_number
+from invertwin.cli import report
 from invertwin.cli.inputs import find_plugin_recording
 from invertwin.cli.options import LookOptions, RecordingOptions
-from invertwin.cli.report import ReportTable, load_texts, quantity_table, save_picture, write_report
+from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import MapPanel
 from invertwin.radar.boards import Mounting
@@ -63,7 +64,9 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         metrics |= {"samples": radar.waveform.samples, "max_range_m": recording.max_range}
     if radar.range_origin is not None:
         metrics["range_origin_m"] = float(radar.range_origin.mean())
-    shown, found, power = _make_panels(capture, chirps, grid, options.frame)
+    shown, found, power, maps = _make_panels(capture, chirps, grid, options.frame)
+    if maps is not None and maps.is_aliased:
+        said.append(report.load_texts("notes")["aliased"].format(found["velocity_span_m_s"]))
     if capture.dataset.get("beat", capture.dataset).attrs.get("units") == "count":
         found["peak_counts_db"] = found.pop("peak_power_db")
     metrics |= found
@@ -86,17 +89,18 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         folder.write_text("points.csv", radars.format_points_csv(points))
         for suffix in ("ply", "pcd"):
             radars.save_points(folder.file(f"points.{suffix}"), points)
-    title, note = options.recording.name, load_texts("notes")["look"]
+    title, notes = options.recording.name, report.load_texts("notes")
     kind = "directions" if chirps is None else "doppler"
     view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", kind)
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
-    again = options.command("look", folder.path)
-    parts = [view, quantity_table(title, metrics), *warning_tables(said)]
+    told = {"again": options.command("look", folder.path), "note": notes["look"]}
+    parts = [view, *draw_spectrogram(maps, folder), quantity_table(title, metrics)]
+    parts += warning_tables(said)
     if grid.u_count > 1 and points is not None and len(points):
-        maps, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
-        above = plotting.from_above(maps, grid, one, {"detections": points.position})
+        of_frame, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
+        above = plotting.from_above(of_frame, grid, one, {"detections": points.position})
         parts.insert(1, save_picture(folder, "above", above, "From above", "above"))
-    return write_report(folder, metrics, title, status, parts, again=again, note=note), answer
+    return report.write_report(folder, metrics, title, status, parts, **told), answer
 
 
 def describe_peak(metrics: dict[str, Any]) -> str:
@@ -105,6 +109,26 @@ def describe_peak(metrics: dict[str, Any]) -> str:
     if "peak_azimuth_deg" in metrics:
         answer += f", azimuth {metrics['peak_azimuth_deg']:.1f}° (left > 0)"
     return answer
+
+
+def describe_frame(
+    maps: radars.DopplerMaps, radar: radars.Radar, chirps: radars.Chirps
+) -> dict[str, Any]:
+    """Numbers of the maps of a frame of chirps, and of what moves."""
+    found: dict[str, Any] = {"velocity_span_m_s": radars.velocity_span(radar, chirps)}
+    found |= maps.strongest_peak.metrics("peak")
+    found |= {"chirps": chirps.count, "moves": maps.moving_peak is not None}
+    if maps.moving_peak is None:
+        return found
+    return {**found, **maps.moving_peak.metrics("mover"), "mover_rates_m_s": maps.moving_rates}
+
+
+def draw_spectrogram(maps: radars.DopplerMaps | None, folder: RunFolder) -> list[ReportPicture]:
+    """The picture of the micro-Doppler of a frame; none if nothing moves."""
+    if maps is None or maps.spectrogram is None:
+        return []
+    figure = plotting.spectrogram(maps.spectrogram)
+    return [save_picture(folder, "micro_doppler", figure, "Micro-Doppler", "micro_doppler")]
 
 
 def warning_tables(said: Sequence[str]) -> list[ReportTable]:
@@ -242,18 +266,12 @@ def _high_resolution_panels(
 
 def _make_panels(
     capture: captures.Capture, chirps: captures.ChirpCapture | None, grid: Grid, frame: int
-) -> tuple[dict[str, MapPanel], dict[str, Any], torch.Tensor]:
-    """Make the pictures and numbers of one frame; return also its power [range, u, v]."""
+) -> tuple[dict[str, MapPanel], dict[str, Any], torch.Tensor, radars.DopplerMaps | None]:
+    """Make the pictures and numbers of one frame; return also its power [range, u, v], and maps."""
     if chirps is not None:
         maps = radars.doppler_maps(chirps.beat, chirps.device, grid, chirps.chirps, frame)
-        numbers = {
-            "chirps": chirps.chirps.count,
-            "velocity_span_m_s": radars.velocity_span(chirps.device, chirps.chirps),
-            **maps.strongest_peak.metrics("peak"),
-            "moves": maps.moving_peak is not None,
-            **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
-        }
-        return plotting.doppler_panels(maps), numbers, maps.total_power
+        numbers = describe_frame(maps, chirps.device, chirps.chirps)
+        return plotting.doppler_panels(maps), numbers, maps.total_power, maps
     spectrum = capture.frames([frame]).spectrum(grid)[0].double()
     shown = plotting.direction_panels("range and direction", spectrum, grid)
     numbers = radars.find_peak(spectrum, grid).metrics("peak")
@@ -261,4 +279,4 @@ def _make_panels(
     if not shown:
         del numbers["peak_azimuth_deg"]
         shown["range"] = MapPanel(spectrum[:, :, 0], grid.ranges, torch.zeros(1), "one channel")
-    return shown, numbers, spectrum
+    return shown, numbers, spectrum, None

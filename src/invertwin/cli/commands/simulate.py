@@ -10,22 +10,22 @@ from typing import Any
 
 import torch
 from jaxtyping import Complex
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from invertwin import plotting
 from invertwin.capture import Capture, ChirpData, ChirpSettings, adc_counts, make_settings, ti
 from invertwin.capture.readers import described_arrays
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.commands.look import describe_peak
+from invertwin.cli import report
+from invertwin.cli.commands.look import describe_frame, describe_peak, draw_spectrogram
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
-from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
+from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RawTable, RunFile, build
 from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
-from invertwin.radar import FMCW, doppler_maps, velocity_span
+from invertwin.radar import FMCW, doppler_maps
 from invertwin.radar.processing.doppler_maps import find_peak
 from invertwin.radar.radar import Radar
 from invertwin.scene import Scene
@@ -33,8 +33,8 @@ from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder
 
 _SURROGATE_SAMPLES = 2_000_000
-# Signals, metrics, picture, its note, power [frame, range, u, v] by title.
-_SimulationOutcome = tuple[torch.Tensor, dict[str, Any], Figure, str, dict[str, torch.Tensor]]
+# Signals, metrics, pictures, power [frame, range, u, v] by title.
+_SimulationOutcome = tuple[torch.Tensor, dict[str, Any], list[ReportPicture], dict[str, Tensor]]
 
 
 def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], str]:
@@ -46,7 +46,7 @@ def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
         make_chirp_settings(run, radar)  # its errors come before any work
     require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
     simulated = _simulate_frames if run.chirps is None else _simulate_moving_frames
-    beat, found, figure, note, maps = simulated(run, folder, scene, radar, grid)
+    beat, found, pictures, maps = simulated(run, folder, scene, radar, grid)
     counts = {"frames": radar.frame_count, "channels": len(radar.virtual_positions)}
     answer, counts = describe_peak(found), counts | {"bins": list(grid.shape)}
     metrics = {"task": "simulate", **counts, **found, "answer": answer}
@@ -54,20 +54,16 @@ def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
         metrics |= write_raw_files(run, radar, beat, folder)
     save_mesh(folder.file("twin.ply"), scene)
     view = plotting.scene(scene, radar, highlight=list(run.truth) or None)
-    shown = ("spectra", "Spectra") if run.chirps is None else ("doppler", "First frame")
-    parts = [
-        save_picture(folder, "scene", view),
-        quantity_table("Simulation", metrics),
-        save_picture(folder, shown[0], figure, shown[1], note),
-    ]
+    view = save_picture(folder, "scene", view)
+    parts = [view, quantity_table("Simulation", metrics), *pictures]
     seen = radar if run.chirps is None else radar.frames([0])
     if grid.u_count > 1 or seen.frame_count > 1:
         above = plotting.from_above(maps, grid, seen, {"scene": scene})
         parts.append(save_picture(folder, "above", above, "From above", "above"))
     count = f"{found['chirps']} chirps a frame" if run.chirps else f"{found['paths']} paths"
     title, status = run.title or "Simulation", f"{answer}; {count}, frames: {radar.frame_count}."
-    tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)
-    return tables, answer
+    told = {"again": "simulate", "note": run.note}
+    return report.write_report(folder, metrics, title, status, parts, **told), answer
 
 
 def _simulate_frames(
@@ -96,7 +92,8 @@ def _simulate_frames(
         "wall_seconds": seconds,
     }
     maps = {"exact signal": found.spectrum, "surrogate": smooth}
-    return found.beat, metrics, plotting.spectrum(maps, grid), "surrogate", maps
+    figure = plotting.spectrum(maps, grid)
+    return found.beat, metrics, [save_picture(folder, "spectra", figure, note="surrogate")], maps
 
 
 def _simulate_moving_frames(
@@ -115,15 +112,11 @@ def _simulate_moving_frames(
         with prefix_errors("chirps"):
             data = ChirpData(beat, replace(make_chirp_settings(run, radar), real=False))
             described_arrays.write_chirps(folder.file("chirps.toml"), data, "chirps.npy", arrays)
-    metrics = {
-        "chirps": chirps.count,
-        "velocity_span_m_s": velocity_span(radar, chirps),
-        **maps.strongest_peak.metrics("peak"),
-        **({} if maps.moving_peak is None else maps.moving_peak.metrics("mover")),
-        "wall_seconds": seconds,
-    }
+    metrics = {"wall_seconds": seconds, **describe_frame(maps, radar, chirps)}
     first = {"first frame": maps.total_power[None]}
-    return beat, metrics, plotting.range_doppler(maps), "doppler", first
+    figure = plotting.range_doppler(maps)
+    view = save_picture(folder, "doppler", figure, "First frame", "doppler")
+    return beat, metrics, [view, *draw_spectrogram(maps, folder)], first
 
 
 _IDLE_TIME = 13e-6  # s, of single ramps: with the ADC start time that a board takes from it

@@ -23,7 +23,8 @@ class DatasetTable(Section):
         samples: how many
         shard: samples of a shard, which is one tar file
         signals: raw = beat signals of every channel; map = power over [grid], with [chirps] over
-            range rate, too
+            range rate, too; micro_doppler = power of what moves over time and range rate, of
+            [chirps]
         classes: class of an object by its name; without it its name
         masks: write how much of every triangle each radar position sees
         paths: write the paths of every sample; not with [chirps]
@@ -31,7 +32,7 @@ class DatasetTable(Section):
 
     samples: Count
     shard: Count = 100
-    signals: Annotated[list[Literal["raw", "map"]], MinLen(1)] = ["map"]
+    signals: Annotated[list[Literal["raw", "map", "micro_doppler"]], MinLen(1)] = ["map"]
     classes: dict[str, PrintableText] = {}
     masks: bool = False
     paths: bool = False

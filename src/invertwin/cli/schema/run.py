@@ -348,6 +348,8 @@ class _RunFile(Section):
         """Refuse data that a data set cannot be made of."""
         if self.dataset is not None and self.dataset.paths and self.chirps is not None:
             raise_key_error("expected false with [chirps], got true; remove it", "dataset.paths")
+        if self.dataset and self.chirps is None and "micro_doppler" in self.dataset.signals:
+            raise_key_error("expected [chirps] with micro_doppler; add it", "dataset.signals")
         if self.observations:
             raise_key_error(
                 "expected none with [dataset], which has one radar, got some", "observations"

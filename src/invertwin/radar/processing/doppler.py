@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Complex, Float, Float64, Int64, Num
@@ -259,6 +259,31 @@ def micro_doppler(
     loop = 0.5 * radar.waveform.wavelength / velocity_span(radar, chirps)
     times = (starts + 0.5 * (length - 1)) * loop
     return Spectrogram(power, times, velocity_axis(radar, chirps, length).to(power.device))
+
+
+def frame_spectrogram(
+    beat: Complex[Tensor, "frame chirp tx rx sample"], radar: Radar, grid: Grid, chirps: Chirps
+) -> Spectrogram:
+    """Compute the micro-Doppler of frames: ``micro_doppler`` without static echoes, averaged over
+    channels and summed over ranges.
+
+    A window has an eighth of the chirps of a frame, but at least 16.
+
+    Args:
+        beat: signals of all chirps of every transmitter.
+        radar: radar with one pose per frame.
+        grid: ranges that are summed.
+        chirps: chirp timing.
+
+    Raises:
+        InputError: fewer than 16 chirps in a frame.
+    """
+    frames, count = beat.shape[:2]
+    signal = (beat - beat.mean(1, keepdim=True)).flatten(0, 1)
+    slow = range_profile(signal, _repeat_poses(radar, count), grid).unflatten(0, (frames, count))
+    length = max(16, count // 8)
+    found = micro_doppler(slow.movedim(1, -1), radar, chirps, length=length, step=length // 8)
+    return replace(found, power=found.power.mean((1, 2)).sum(1))
 
 
 def _steer_beams(

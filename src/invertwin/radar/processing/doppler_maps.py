@@ -1,7 +1,7 @@
 """Maps of one frame of chirps over range, range rate and direction, and their peaks."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -29,6 +29,8 @@ _OWN_NOISE = 16
 # False-alarm probability of moving targets, and the rounding of samples.
 _FALSE_ALARM_RATE = 1e-3
 _ROUNDING = 1e-12
+_MIN_SPECTROGRAM_CHIRPS = 32
+_WEAKEST_PART = 1e-3  # of a moving target, relative to the strongest: above sidelobes
 _BINS_AT_ONCE = 2e7  # bins of range rate, range, u, v per chunk
 _Cells = Bool[Tensor, "velocity range"]  # marked ones
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]  # of every ramp
@@ -77,6 +79,10 @@ class DopplerMaps:
             [range, u, v]; None = no moving target.
         strongest_peak: strongest cell.
         moving_peak: strongest moving cell; None = no cell above the noise.
+        moving_rates: lowest and highest range rate of moving cells within 30 dB of the strongest
+            [m/s].
+        spectrogram: micro-Doppler of the ranges with moving cells [time, velocity]; None = no
+            moving cell, or fewer than 32 chirps.
     """
 
     grid: Grid
@@ -86,6 +92,14 @@ class DopplerMaps:
     moving_power: Float64[Tensor, "range u v"] | None
     strongest_peak: Peak
     moving_peak: Peak | None
+    moving_rates: tuple[float, float] | None = None
+    spectrogram: doppler.Spectrogram | None = None
+
+    @property
+    def is_aliased(self) -> bool:
+        """True if moving cells reach the largest unambiguous range rate."""
+        ends = float(self.velocities[0]), float(self.velocities[-1])
+        return any(rate in ends for rate in self.moving_rates or ())
 
 
 def doppler_maps(
@@ -117,11 +131,21 @@ def doppler_maps(
     moving = doppler.range_doppler(signal - signal.mean(1, keepdim=True), radar, grid, chirps)
     power = moving.abs().square().mean((2, 3))[0]
     cells = _detect_moving_cells(power, flat, len(radar.virtual_positions))
-    movers, mover = None, None
-    if bool(cells.any()):
-        movers, mover = _sum_range_rates(moving, power, radar, grid, chirps, cells)
     velocities = doppler.velocity_axis(radar, chirps).to(flat.device)
-    return DopplerMaps(grid, velocities, flat, everything, movers, strongest, mover)
+    maps = DopplerMaps(grid, velocities, flat, everything, None, strongest, None)
+    if not bool(cells.any()):
+        return maps
+    movers, mover = _sum_range_rates(moving, power, radar, grid, chirps, cells)
+    cells = cells & (power > _WEAKEST_PART * power[cells].max())
+    rates, rows = velocities[cells.any(1)], cells.any(0).nonzero()[:, 0]
+    maps = replace(maps, moving_power=movers, moving_peak=mover)
+    maps = replace(maps, moving_rates=(float(rates[0]), float(rates[-1])))
+    if chirps.count < _MIN_SPECTROGRAM_CHIRPS:
+        return maps
+    count, start = int(rows[-1] - rows[0]) + 1, float(grid.ranges[rows[0]])
+    near = replace(grid, range_start=start, range_count=count)
+    found = doppler.frame_spectrogram(signal, radar, near, chirps)
+    return replace(maps, spectrogram=replace(found, power=found.power[0]))
 
 
 def _sum_range_rates(
