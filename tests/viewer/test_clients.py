@@ -28,6 +28,8 @@ from invertwin.viewer import (
     page_html,
 )
 from invertwin.viewer.guard import is_valid_message
+from invertwin.viewer.layers import ELLIPSOID
+from invertwin.viewer.server import _NO_OBJECT
 from viewer.test_display import GRID, radar, scene
 from viewer.test_guard import answered
 
@@ -317,3 +319,21 @@ def test_fifty_clients_and_a_hundred_slow_ones_hinder_no_good_one(viewer):
             assert answered(viewer).status == 200
             times.append(time.monotonic() - begun)
         assert max(times) < 1.0
+
+
+def test_a_moved_object_has_no_loss_and_no_error_bars_of_the_fit():
+    """They come back with the object; a radius is a plain number."""
+    bar = DisplayLayer(f"{ELLIPSOID}/a", "lines", np.float32([[0, 0, 0], [0.34, 0, 0]]))
+    display = build_display(scene(), {"": (radar(), GRID)}, "t", fitted=["a/cube"])
+    made = [DisplayStep(k, f"step {k}, loss {k + 1}", {}) for k in range(2)]
+    display = replace(display, layers=[*display.layers, bar], steps=made)
+    with Viewer(display, {"": InteractiveSensor(scene(), radar(), GRID)}, port=0) as viewer:
+        until(lambda: viewer._where.value == "step 1, loss 2")
+        drawn = viewer._nodes[f"{ELLIPSOID}/a"]
+        handles = viewer._server.scene._handle_from_node_name
+        (label,) = (handles[name] for name in handles if name.endswith("/radius"))
+        assert label.text == "95 %: 170.0 mm"
+        viewer._select_object("a/cube")
+        assert (viewer._where.value, drawn.visible) == ("moved by hand", False)
+        viewer._select_object(_NO_OBJECT)
+        assert (viewer._where.value, drawn.visible) == ("step 1, loss 2", True)

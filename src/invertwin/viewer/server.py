@@ -259,6 +259,10 @@ class Viewer:
         if node is not None:  # what was moved before goes back
             node.wxyz, node.position = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         self._update_state(moved_object=name, motion=_IDENTITY)
+        # Loss and error bars are those of the fit.
+        self._set_visibility(layers.ELLIPSOID, name == _NO_OBJECT)
+        labels = [step.label for step in self._steps] or [""]
+        self._where.value = labels[self._wish.step] if name == _NO_OBJECT else "moved by hand"
         if name != _NO_OBJECT:
             self._center = self._links[self._wish.sensor].scene[name].center.detach().numpy()
             self._gizmo.position, self._gizmo.wxyz = tuple(self._center), (1.0, 0.0, 0.0, 0.0)
@@ -300,7 +304,7 @@ class Viewer:
                 # It is inside of its object; only labels show through.
                 middle = (layer.points.min(0) + layer.points.max(0)) / 2
                 radius = np.linalg.norm(layer.points - middle, axis=1).max()
-                scene.add_label(f"{node}/radius", f"95 %: {1e3 * radius:.2g} mm", position=middle)
+                scene.add_label(f"{node}/radius", f"95 %: {1e3 * radius:.1f} mm", position=middle)
         else:
             how |= {"point_size": 0.006 * size * self._size, "point_shape": "circle"}
             how |= {"colors": layer.color, "precision": "float32"}

@@ -26,7 +26,6 @@ from invertwin.cli.schema.variation import draw_sample
 from invertwin.datasets import SampleDataset, labels, shards
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.processing import doppler
-from invertwin.radar.radar import Radar
 from invertwin.registry.section import require_section
 from invertwin.runtime.engines import Engine, run_jobs
 from invertwin.runtime.progress import track
@@ -192,7 +191,9 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         scene, sensor = _build_sample(own)
         table = require_section(run, "dataset", "a data set")
         arrays = _simulate_signals(own, scene, sensor, table)
-        begun = _labelled_scene(own, scene, sensor.radar)
+        begun, chirps = scene, own.chirps and own.chirps.build()  # labels refer to the start
+        if chirps is not None:
+            begun = scene_at_start(own, scene, float(chirps.times(sensor.radar.shape[1]).max()))
         seen = labels.triangle_visibility(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
@@ -245,13 +246,6 @@ def _simulate_signals(
     found = {"raw": beat.resolve_conj().to(torch.complex64), "map": power.float()}
     found["micro_doppler"] = moving.float()
     return {_ARRAY_NAMES[n]: found[n].numpy() for n in table.signals} | more
-
-
-def _labelled_scene(run: RunFile, scene: Scene, radar: Radar) -> Scene:
-    """Return the scene at the start of the frame, to which the labels refer."""
-    if run.chirps is None:
-        return scene
-    return scene_at_start(run, scene, float(run.chirps.build().times(radar.shape[1]).max()))
 
 
 def _describe_arrays(run: RunFile) -> dict[str, shards.ArrayInfo]:
