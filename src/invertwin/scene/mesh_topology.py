@@ -78,8 +78,13 @@ def close_cracks(
         the moves that close the cracks.
     """
     groups = np.zeros(len(points), dtype=np.int64) if groups is None else groups
-    places = separate_groups(points, groups)
-    first = weld_vertices(places)
+    places = separate_groups(points, groups, faces)
+    first, stray = weld_vertices(places), places[:, 0] < 0
+    if stray.any():  # they move onto a vertex of their group
+        inside = np.flatnonzero(~stray)[::-1]
+        lowest = np.full(groups.max() + 1, -1)
+        lowest[groups[inside]] = inside
+        first = np.where(stray & (lowest[groups] >= 0), lowest[groups], first)
     welded = first[faces]
     whole, onto, open_edges, width = _whole_edges(welded, places, owner), first[:, None], 0, 0.0
     is_open = bool((whole.counts == 1).any())
@@ -270,22 +275,33 @@ def triangle_sides(faces: Faces) -> Int64[np.ndarray, "h 2"]:
     return np.stack([faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()]).T
 
 
-def separate_groups(points: Points, groups: Groups) -> Points:
+def separate_groups(points: Points, groups: Groups, faces: Faces) -> Points:
     """Scale each group of vertices to a diagonal of 1, and place them side by side.
+
+    Exports leave vertices of no triangle, and triangles that are points, anywhere, as at the
+    origin: they stand aside of all groups, at negative x, and no size depends on them.
 
     Args:
         points: positions [m].
         groups: number of the group of each vertex, from 0.
+        faces: vertices of each triangle.
     """
-    index, start = sort_rows(groups, count=int(groups.max()) + 1)
-    found = points.copy()
-    for row, own in enumerate(np.split(index, start[1:]) if len(start) > 1 else [slice(None)]):
+    used, x = np.zeros(len(points), dtype=bool), points[:, 0][faces]
+    flat = np.flatnonzero((x == x[:, :1]).all(1))
+    flat = flat[(points[faces[flat]] == points[faces[flat, :1]]).all((1, 2))]
+    used[np.delete(faces, flat, axis=0) if len(flat) else faces] = True
+    inside, found = np.flatnonzero(used), points.copy()
+    index, start = sort_rows(groups[inside], count=int(groups.max()) + 1)
+    one = len(start) == 1 and len(inside) == len(points)
+    parts = [slice(None)] if one else np.split(inside[index], start[1:])[: len(start)]
+    for row, own in enumerate(parts):
         # Extrema of one run, ten times faster than those along the axis.
         part = found[own]
         part -= np.minimum.reduceat(part, [0])
         part /= np.linalg.norm(np.maximum.reduceat(part, [0])) or 1.0
         part[:, 0] += 2.0 * row
         found[own] = part
+    found[~used] = -1.0
     return found
 
 

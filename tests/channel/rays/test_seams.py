@@ -248,8 +248,34 @@ def test_doubled_faces_count_once_at_their_edges():
 
 
 def test_groups_of_vertices_stay_apart():
-    places = separate_groups(np.zeros((4, 3)), np.array([0, 0, 1, 1]))
-    assert weld_vertices(places).tolist() == [0, 0, 2, 2]
+    points = np.repeat(np.arange(6.0).reshape(2, 3), 2, 0)[[0, 2, 1, 3]]
+    faces = np.array([[0, 1, 0], [2, 3, 2]])
+    places = separate_groups(points, np.array([0, 0, 1, 1]), faces)
+    assert weld_vertices(places).tolist() == [0, 1, 2, 3]
+    assert np.linalg.norm(places[1] - places[0]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("stray", [[], [[8, 8, 8]], [[8, 9, 10]]])
+def test_stray_vertices_and_points_do_not_widen_the_tolerance(stray):
+    clean = box((0.3, 0.4, 0.5))
+    vertices = torch.cat([clean.vertices, torch.full((3, 3), 1e6).double()])
+    mesh = Mesh(vertices, torch.cat([clean.faces, torch.tensor(stray).long().reshape(-1, 3)]))
+    assert table(mesh) == {2: 18}
+    assert mesh.summary().open_edges == 0
+
+
+def test_meshes_that_share_their_faces_have_vertices_of_their_own():
+    clean = box((0.3, 0.4, 0.5))
+    more = Mesh(torch.cat([clean.vertices, torch.full((1, 3), 1e6).double()]), clean.faces)
+    for mesh in (clean, more):
+        places = topology_of([mesh]).join_vertices([mesh.vertices])
+        assert len(places) == len(mesh.vertices)
+        assert float(places.abs().max()) == pytest.approx(0.25)
+
+
+def test_mesh_of_points_has_no_edges():
+    point = Mesh(torch.rand(3, 3).double(), torch.tensor([[1, 1, 1]]))
+    assert table(point) == {}
 
 
 def panels(pose=None):

@@ -198,7 +198,7 @@ def topology_of(
             move together share edges. None = no object shares edges with another one.
         scenes: scene of each object; None = one scene.
     """
-    faces = [mesh.faces for mesh in meshes]
+    faces, sizes = [mesh.faces for mesh in meshes], [len(mesh.vertices) for mesh in meshes]
     with _DisableFuncTorch():
         groups = np.arange(len(meshes))
         if vertices is not None:
@@ -209,11 +209,11 @@ def topology_of(
             g: torch.cat([world[n] for n in joined if groups[n] == g]) for g in groups[joined]
         }
         # The entry holds the face tensors, so that their ids stay theirs.
-        key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces))
+        key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces), *sizes)
         _, known, found = _topologies.get(key, (faces, bodies, None))
         # The seams of a group stay as they are while its objects move as one body.
         if found is None or not all(is_one_motion(known[g], bodies[g]) for g in bodies):
-            starts = [0, *itertools.accumulate(len(mesh.vertices) for mesh in meshes)]
+            starts = [0, *itertools.accumulate(sizes)]
             fixed = [strip_derivatives(mesh.vertices) for mesh in meshes]
             own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
             owner = torch.cat([torch.full((len(v),), n) for n, v in enumerate(fixed)])
