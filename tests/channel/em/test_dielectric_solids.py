@@ -155,6 +155,27 @@ def test_a_lossy_block_shows_its_front_less_what_comes_back():
         assert (float(inner.abs().max()) > 0) == (loss < 1)  # beyond 80 dB nothing is followed
 
 
+def half_opened(name: str) -> Mesh:
+    """A box with a hole, or a wall across its middle; a plate or a corner of mixed winding."""
+    whole = box((SIDE, SIDE, THICKNESS))
+    if name == "hole":
+        return Mesh(whole.vertices, whole.faces[:-2])
+    if name == "partition":
+        middle = float64([0.0, 1.0, 1.0]) * whole.vertices[[0, 4, 6, 2]]
+        wall = torch.tensor([[8, 9, 10], [8, 10, 11]])
+        return Mesh(torch.cat([whole.vertices, middle]), torch.cat([whole.faces, wall]))
+    faces = whole.faces[:2] if name == "plate" else whole.faces[[0, 1, 4, 5]]
+    return Mesh(whole.vertices, torch.cat([faces[:1].flip(1), faces[1:]]))
+
+
+@pytest.mark.parametrize("name", ["hole", "partition", "plate", "corner"])
+def test_a_solid_whose_mesh_is_open_is_named(name, recwarn):
+    scene = Scene({"block": Object(half_opened(name), RefractingBody(4.0))})
+    iw.rcs(scene, BROADSIDE, 30e9, edges=0)
+    named = [w for w in recwarn if "mesh of block is open, though it almost" in str(w.message)]
+    assert len(named) == (name in ("hole", "partition"))
+
+
 # Energy and reciprocity.
 
 

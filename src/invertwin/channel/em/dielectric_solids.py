@@ -6,6 +6,7 @@ decays, and propagates along the real part of K.
 
 import cmath
 import math
+import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -15,13 +16,14 @@ from torch import Tensor
 
 from invertwin.channel.em.plane_waves import SmoothInterfaces, Vectors, cross, dot
 from invertwin.checks import is_differentiated
-from invertwin.errors import InputError
+from invertwin.errors import InputError, PhysicsWarning
 
 _FacetOwners = Int64[Tensor, " facet"]
 MIN_CHORD_AMPLITUDE = 1e-4
 """Amplitude after the mean chord 4V/A of a body, below which no path is traced inside."""
 AIR = -1
 """Number of the medium outside of all bodies."""
+_MAX_OPENING = 1 / 3  # of the surface of a mesh that was meant to be closed
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,9 @@ def group_solids(
         names: object names, [object].
     """
     bodies = [torch.nonzero(owner == number)[:, 0] for number in range(len(names))]
+    for own, name in zip(bodies, names, strict=True):
+        if not closed[own].all() and not _is_opaque(interfaces[0].rows(own)):
+            _warn_openings(corners.detach()[own], name)
     chords = [_mean_chord(corners.detach()[own]) for own in bodies]
     groups: dict[tuple[object, ...], list[int]] = {}
     for f, (skin, k) in enumerate(zip(interfaces, wave_numbers, strict=True)):
@@ -169,6 +174,21 @@ def is_homogeneous(interfaces: SmoothInterfaces) -> bool:
 def _is_opaque(interfaces: SmoothInterfaces) -> bool:
     """Return True if there is no dielectric body behind a surface."""
     return bool((interfaces.conducting | torch.isfinite(interfaces.thickness)).any())
+
+
+def _warn_openings(corners: Tensor, name: str) -> None:
+    """Warn of an open mesh whose openings are small: a solid with a hole is no half space."""
+    areas = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total, flat = float(areas.norm(dim=1).sum()), 1e-3 * float(areas.norm())
+    is_body = float(torch.linalg.svdvals(areas)[-1]) > flat  # unlike plates, however they are wound
+    if is_body and float(areas.sum(0).norm()) < _MAX_OPENING * total:
+        warnings.warn(
+            f"the mesh of {name} is open, though it almost closes a body: of the dielectric only "
+            "its front faces reflect; close the mesh if it is a solid (Mesh.summary counts its "
+            "open edges)",
+            PhysicsWarning,
+            stacklevel=2,
+        )
 
 
 def _mean_chord(corners: Tensor) -> float:
