@@ -1,11 +1,14 @@
 """Points of one frame: several in one range, of one chirp too, and no sidelobes."""
 
+import math
+
 import pytest
 import torch
 
 from invertwin.radar import FMCW, Chirps, Radar, detect_points, format_points_csv
 from invertwin.radar.boards import board
-from invertwin.radar.processing.reflectors import noise_power
+from invertwin.radar.processing.reflectors import _sidelobe_powers, noise_power
+from invertwin.radar.waveform import unit_window
 from oracles.moving_point import moving_point
 
 ARRAYS = board("IWR6843ISK").arrays(elevation=1)
@@ -67,6 +70,20 @@ def test_what_lies_outside_of_the_grid_has_no_comb_of_sidelobes(count, place):
     found = detect_points(beat, RADAR, GRID, None if count == 1 else chirps, 0)
     assert len(found) == 1
     assert float(found.range[0]) == pytest.approx(3.0, abs=0.03)
+
+
+def test_sidelobes_are_those_of_the_windows():
+    rates, ranges = _sidelobe_powers(16, 20, RADAR, GRID)
+    beside = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
+    weight = unit_window("hamming", 16).to(torch.complex128)
+    for bins in (0, 1, 5, 15):
+        turns = (bins + beside)[:, None] / 16 * torch.arange(16)
+        expected = (torch.exp(2j * math.pi * turns) @ weight).abs().square().max()
+        assert float(rates[bins]) == pytest.approx(float(expected), rel=1e-6)
+        distance = (bins + beside) * GRID.range_step
+        expected = RADAR.waveform.range_response(distance, RADAR.window).max()
+        assert float(ranges[bins]) == pytest.approx(float(expected), rel=1e-6)
+    assert (len(rates), len(ranges)) == (16, 20)
 
 
 def test_noise_power_of_any_quantile():

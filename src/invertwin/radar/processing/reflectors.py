@@ -28,6 +28,7 @@ _ABOVE_SIDELOBES = 4.0
 # Minimum relative power of a further direction in one cell: gain and phase errors of a board's
 # channels leave this residual.
 _MIN_RELATIVE_POWER = 0.1
+_BLOCK = 1024  # distances
 _OUTSIDE_ECHOES = 32  # strongest echoes outside of the grid whose sidelobes count
 _FALSE_DIRECTION_RATE = 1e-3
 _Levels = Float64[Tensor, "velocity range"]  # mean over channels
@@ -123,19 +124,22 @@ def _find_cells(everywhere: _Levels, radar: Radar, grid: Grid, looks: int) -> li
     found = _threshold_cells(flat, looks) & _local_maxima(flat)
     places = torch.nonzero(found)
     places = places[flat[found].argsort(descending=True)]
+    over_rates, over_ranges = _sidelobe_powers(len(flat), everywhere.shape[1], radar, grid)
+
+    def sidelobes(offsets: Int64[Tensor, "cell 2"]) -> Float64[Tensor, " cell"]:
+        return over_rates[offsets[:, 0] % len(flat)] * over_ranges[offsets[:, 1].abs()]
+
     reach, chosen = torch.zeros(len(places), dtype=torch.float64), []
     outside = torch.nonzero(_local_maxima(rest)) if rest.numel() else places[:0]
     outside = outside + torch.tensor([0, grid.range_count])
     levels = everywhere[*outside.T]
     for k in levels.argsort(descending=True)[:_OUTSIDE_ECHOES].tolist():
-        response = _sidelobe_response(places - outside[k], len(flat), radar, grid)
-        reach += (levels[k] * response).sqrt()
+        reach += (levels[k] * sidelobes(places - outside[k])).sqrt()
     for i, (v, r) in enumerate(places.tolist()):
         if flat[v, r] <= _ABOVE_SIDELOBES * reach[i].square():
             continue
         chosen.append((v, r))
-        response = _sidelobe_response(places - places[i], len(flat), radar, grid)
-        reach += (flat[v, r] * response).sqrt()
+        reach += (flat[v, r] * sidelobes(places - places[i])).sqrt()
     return chosen
 
 
@@ -151,21 +155,19 @@ def _threshold_cells(flat: _Levels, looks: int) -> Bool[Tensor, "velocity range"
     return torch.cat([detection.ordered_statistics_cfar(row[None], **how) for row in flat])
 
 
-def _sidelobe_response(
-    offsets: Int64[Tensor, "cell 2"], count: int, radar: Radar, grid: Grid
-) -> Float64[Tensor, " cell"]:
-    """Return the highest sidelobe power of a point at given cell offsets, from the windows.
+def _sidelobe_powers(
+    rate_count: int, range_count: int, radar: Radar, grid: Grid
+) -> tuple[Float64[Tensor, " rate"], Float64[Tensor, " range"]]:
+    """Return the highest sidelobe power of a point 0, 1, … range-rate and range bins away.
 
     A point is up to half a bin from the centre of its cell, where sidelobes are non-zero.
     """
-    weight = unit_window("hamming", count).to(torch.complex128)
-    beside = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
-    rates, ranges = (offsets.double()[..., None] + beside).unbind(1)
-    turns = rates[..., None] / count * torch.arange(count)
-    over_rates = (torch.exp(2j * math.pi * turns) @ weight).abs().square()
-    distance = (ranges * grid.range_step).flatten()
-    over_ranges = radar.waveform.range_response(distance, radar.window).reshape(ranges.shape)
-    return over_rates.amax(1) * over_ranges.amax(1)
+    rates = torch.fft.fft(unit_window("hamming", rate_count), 2 * rate_count).abs().square()
+    distance = (0.5 * grid.range_step * torch.arange(2 * range_count).double()).split(_BLOCK)
+    response = [radar.waveform.range_response(part, radar.window) for part in distance]
+    half_bins = rates.double(), torch.cat(response)
+    found = [torch.stack([x[::2], x[1::2], x.roll(1)[::2]]).amax(0) for x in half_bins]
+    return found[0], found[1]
 
 
 def _resolve_directions(
