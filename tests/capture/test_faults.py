@@ -106,9 +106,15 @@ def test_lost_packets():
     assert str(found).startswith(
         "dropped samples: 64 of 4096 samples are zeros in runs of up to 16"
     )
+
+
+def test_silent_channels():
     dead = ECHOES.clone()
     dead[..., 2, :] = 0
-    assert names(dead) == []
+    (found,) = find_faults(ChirpCapture(dead, RADAR, CHIRPS))
+    assert found.name == "silent channels"
+    assert found.evidence.startswith("2 of 8 channels are zeros (TX 1 with RX 3, TX 2 with RX 3)")
+    assert "silent channels" not in names(0 * ECHOES)
 
 
 @pytest.mark.parametrize("chirp", [slice(None), slice(5, 6)], ids=["all", "one"])

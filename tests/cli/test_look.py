@@ -60,6 +60,17 @@ def recording(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_echoes_in_the_farther_half_only_may_be_mirrored(recording, monkeypatch, turned):
+    description = (recording / "adc.toml").read_text()
+    if turned:
+        description = description.replace("[data]", "[data]\nconjugate = true")
+    (recording / "turned.toml").write_text(description)
+    assert call(monkeypatch, "look", "turned.toml") == 0
+    said = read_metrics(recording / "out" / "turned")["warnings"]
+    assert any("I and Q are exchanged; say conjugate = true" in line for line in said) == turned
+
+
 def test_the_command_of_the_start_page(recording, monkeypatch, repository):
     page = (repository / "docs" / "start.md").read_text()
     (line,) = re.findall(r"^    \.venv/bin/invertwin (look .*)$", page, re.MULTILINE)

@@ -84,6 +84,13 @@ def test_comments_of_windows_tools_do_not_refuse_a_file(tmp_path, coding):
     assert lines[1:] == ["# GHz S RI", "1 0.5 0"]
 
 
+@pytest.mark.parametrize("coding", ["utf-16", "utf-8-sig"])
+def test_marks_of_byte_order_tell_the_coding(tmp_path, coding):
+    file = tmp_path / "sweep.s1p"
+    file.write_bytes("# GHz S RI\n1 0.5 0\n".encode(coding))
+    assert read_text(file, "a sweep").splitlines() == ["# GHz S RI", "1 0.5 0"]
+
+
 def test_data_are_no_text(tmp_path):
     file = tmp_path / "samples.cfg"
     file.write_bytes(bytes(range(256)))

@@ -26,7 +26,7 @@ from invertwin.capture.readers.radar_fields import (
 )
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
-from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.constants import SPEED_OF_LIGHT, read_table
 from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_samples
@@ -35,6 +35,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.storage.untrusted import convert_read_errors
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["capture"]
 _Profiles = Complex[Tensor, "frame range"]
 BeatUnit = Literal["1", "count"]
 
@@ -79,8 +80,7 @@ class RangeInterpolator:
         low, high = float(ranges.min()), float(ranges.max())
         if low < self._first - 1e-9 or high > self._last + 1e-9:
             raise InputError(
-                f"expected ranges within the profile, {self._first:g} to {self._last:g} m, got "
-                f"{low:g} to {high:g} m; choose a smaller grid or nearer points"
+                _TEXTS["outside_of_profile"].format(self._first, self._last, low, high)
             )
         offset = ranges - self._first
         value = interpolate_samples(self._samples, offset / self._step)
@@ -138,10 +138,7 @@ class Capture:
         samples = torch.from_numpy(beat) if isinstance(beat, np.ndarray) else beat
         if not isinstance(samples, Tensor) or not samples.is_complex():
             got = samples.dtype if isinstance(samples, Tensor) else type(samples).__name__
-            raise InputError(
-                f"expected complex (I/Q) beat samples, got {got}; of real ADC samples take the "
-                "analytic signal (scipy.signal.hilbert) along the last axis first"
-            )
+            raise InputError(_TEXTS["real_samples"].format(got))
         return cls._assemble({"beat": to_data_array(BEAT_DIMS, samples, unit)}, radar, times)
 
     @classmethod
@@ -300,10 +297,7 @@ class Capture:
         """
         track = self.track
         if track is None:
-            raise InputError(
-                "expected a capture with the track of the radar, got none; "
-                "a clock offset can be fitted only where the track is known"
-            )
+            raise InputError(_TEXTS["no_track"])
         return track.interpolate(self.times + (self.clock_offset + clock_shift))
 
     def recalibrate(self, clock_offset: float, range_bias: float) -> "Capture":
@@ -342,10 +336,7 @@ class Capture:
         if "beat" in self.dataset:
             return exact_spectrum(self.beat, self._radar, grid)
         if grid.shape[1:] != (1, 1):
-            raise InputError(
-                f"expected a grid of ranges only, got {grid.u_count} × {grid.v_count} directions; "
-                "range profiles of one channel do not resolve directions"
-            )
+            raise InputError(_TEXTS["directions"].format(grid.u_count, grid.v_count))
         profile = self.interpolator()(grid.ranges.expand(self.frame_count, -1))
         return profile.abs().square()[..., None, None]
 
@@ -357,10 +348,7 @@ class Capture:
     def _read_data(self, name: str) -> Tensor:
         if name not in self.dataset:
             held = "beat" if "beat" in self.dataset else "range_profile"
-            raise InputError(
-                f"expected a capture of {name}, got one of {held}; "
-                "captures hold raw samples or range profiles, not both"
-            )
+            raise InputError(_TEXTS["other_data"].format(name, held))
         return read_tensor(self.dataset, name)
 
 
@@ -371,33 +359,21 @@ def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
         for dim, size in zip(variable.dims, variable.shape, strict=True):
             other, expected = sizes.setdefault(str(dim), (name, size))
             if size != expected:
-                raise InputError(
-                    f"expected {expected} along {dim} in {name} as in {other}, got {size}; "
-                    "data and radar must describe the same frames, elements and samples"
-                )
+                raise InputError(_TEXTS["sizes"].format(expected, dim, name, other, size))
 
 
 def _check_dataset(dataset: xr.Dataset) -> Radar:
     """Check a dataset, and return its radar."""
     held = [name for name in ("beat", "range_profile") if name in dataset]
     if len(held) != 1:
-        raise InputError(
-            f"expected a capture with either beat or range_profile, got {held or 'neither'}; "
-            "the file is no capture or was written by another program"
-        )
+        raise InputError(_TEXTS["no_data"].format(held or "neither"))
     data, dims = dataset[held[0]], BEAT_DIMS if "beat" in held else PROFILE_DIMS
     if data.dims != dims or data.dtype.kind != "c":
-        raise InputError(
-            f"expected complex {held[0]} with dimensions {dims}, got {data.dtype} with "
-            f"{data.dims}; label the data that way"
-        )
+        raise InputError(_TEXTS["kind"].format(held[0], dims, data.dtype, data.dims))
     for name, variable in dataset.variables.items():
         bad = int((~(np.abs(variable.values) <= MAX_NUMBER)).sum())
         if bad:
-            raise InputError(
-                f"expected finite {name}, got {bad} NaN, infinite or too large of {variable.size}; "
-                "drop those frames or samples"
-            )
+            raise InputError(_TEXTS["not_finite"].format(name, bad, variable.size))
     radar = radar_from_fields(dataset)
     if "beat" in held:
         _check_beat(dataset, radar)
@@ -410,22 +386,13 @@ def _check_beat(dataset: xr.Dataset, radar: Radar) -> None:
     waveform, got = radar.waveform, dataset.sizes["sample"]
     expected = waveform.samples if isinstance(waveform, SampledWaveform) else None
     if expected != got:
-        raise InputError(
-            f"expected {expected} samples per ramp as in the waveform {type(waveform).__name__}, "
-            f"got {got}; beat samples need an FMCW waveform that says how many there are"
-        )
+        raise InputError(_TEXTS["samples"].format(expected, type(waveform).__name__, got))
 
 
 def _check_profile(dataset: xr.Dataset) -> None:
     steps = read_tensor(dataset, "range").diff()
     if not len(steps) or not ((steps / steps.mean() - 1).abs() <= 1e-3).all() or steps[0] <= 0:
-        raise InputError(
-            "expected at least 2 uniform, ascending ranges, got others; "
-            "resample the profiles onto uniform ranges in metres"
-        )
+        raise InputError(_TEXTS["ranges"])
     for end in ("tx", "rx"):
         if dataset.sizes[end] != 1:
-            raise InputError(
-                f"expected one {end} element with range profiles, got {dataset.sizes[end]}; "
-                "range profiles are those of one channel"
-            )
+            raise InputError(_TEXTS["elements"].format(end, dataset.sizes[end]))

@@ -37,8 +37,8 @@ class Fault:
     """A fault of a recording.
 
     Attributes:
-        name: ``complex only by type``, ``ghosts``, ``dropped samples``, ``phase break``,
-            ``leakage`` or ``saturation``.
+        name: ``complex only by type``, ``ghosts``, ``dropped samples``, ``silent channels``,
+            ``phase break``, ``leakage`` or ``saturation``.
         evidence: Evidence in the samples, and the remedy.
     """
 
@@ -76,6 +76,7 @@ def find_faults(
     radar = recording.radar()
     waveform = require_sampled_waveform(radar)
     found = [detect_saturation(beat, real=real), detect_lost_samples(beat, real=real)]
+    found.append(detect_silent_channels(beat))
     beat = _limit_samples(beat)
     if not any(found):
         # Both of them break phases and make ghosts, too.
@@ -152,6 +153,7 @@ def detect_saturation(beat: _Beat, *, real: bool) -> Fault | None:
 
 _FALSE_ALARM_PROBABILITY = 1e-4  # probability that a sound recording in noise is called faulty
 _MIN_RUN_LENGTH = 8
+_MAX_NAMED = 4  # channels
 
 
 def detect_lost_samples(beat: _Beat, *, real: bool) -> Fault | None:
@@ -177,6 +179,20 @@ def detect_lost_samples(beat: _Beat, *, real: bool) -> Fault | None:
     if longest < _MIN_RUN_LENGTH or zero.numel() * share**longest > _FALSE_ALARM_PROBABILITY:
         return None
     return _fault("dropped samples", int(long.sum()), zero.numel(), longest)
+
+
+def detect_silent_channels(beat: _Beat) -> Fault | None:
+    """Channels with zeros only, beside others with signals.
+
+    Args:
+        beat: Samples.
+    """
+    sound = (beat != 0).any(4).any(0).any(0)
+    named = [f"TX {tx + 1} with RX {rx + 1}" for tx, rx in torch.nonzero(~sound).tolist()]
+    if not named or not bool(sound.any()):
+        return None
+    shown = ", ".join(named[:_MAX_NAMED]) + ", …" * (len(named) > _MAX_NAMED)
+    return _fault("silent channels", len(named), sound.numel(), shown)
 
 
 def _zero_run_lengths(zero: Bool[Tensor, "row sample"]) -> Int64[Tensor, "row sample"]:

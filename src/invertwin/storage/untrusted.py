@@ -174,6 +174,9 @@ def read_text(path: str | Path, what: str) -> str:
         if file.stat().st_size > _MAX_TEXT:
             raise ValueError("more than 256 MB")
         content = file.read_bytes()
+        # As PowerShell writes what it redirects: every second byte of Latin letters is zero.
+        if content[:2] in (b"\xff\xfe", b"\xfe\xff") and content.count(0) > len(content) / 3:
+            return content.decode("utf-16")
         if b"\0" in content:
             raise ValueError("zero bytes")
         try:

@@ -122,6 +122,41 @@ def test_negative_frequencies_are_conjugated(described):
     assert torch.equal(turned.samples, plain.samples.conj().resolve_conj())
 
 
+def test_i_and_q_may_be_a_dimension(described):
+    array = np.arange(3 * 5 * 2 * 4 * 8, dtype=np.int16).reshape(3, 5, 2, 4, 8)
+    path = described(array, '"frame", "rx"', '"frame", "iq", "rx"')
+    data = read_chirps(path)
+    assert data.samples.shape == (5, 1, 3, 4, 8)
+    assert not data.settings.real
+    assert data.samples.dtype == torch.complex64
+    assert data.samples[1, 0, 2, 3, 7] == complex(*array[2, 1, :, 3, 7].tolist())
+    np.save(path.parent / "adc.npy", array[:, :, :1])
+    with pytest.raises(InputError, match="2 of them along iq, I and Q"):
+        read_chirps(path)
+
+
+@pytest.mark.parametrize(
+    "names", [("real", "imag"), ("imag", "real"), ("i", "r"), ("I", "Q"), ("Q", "I")]
+)
+def test_parts_are_told_by_their_names(tmp_path, described, names):
+    pairs = np.zeros((3, 5, 4, 8), [(name, "<i2") for name in names])
+    pairs[next(name for name in names if name in ("real", "r", "I"))] = 3
+    pairs[next(name for name in names if name in ("imag", "i", "Q"))] = -4
+    path = described(None, 'file = "adc.npy"', 'file = "adc.h5"\nvariable = "x"')
+    with h5py.File(tmp_path / "adc.h5", "w") as file:
+        file["x"] = pairs
+    assert (read_chirps(path).samples == 3 - 4j).all()
+
+
+def test_powers_are_no_samples(described):
+    generator = np.random.default_rng(3)
+    shape = (3, 5, 4, 8)
+    with pytest.raises(InputError, match="which oscillate, got numbers as powers"):
+        read_chirps(described(generator.standard_normal(shape) ** 2))
+    offset = np.round(100 * generator.standard_normal(shape) + 2048).astype(np.uint16)
+    assert read_chirps(described(offset)).settings.real
+
+
 def test_whole_numbers_may_be_saturated(described):
     array = np.zeros((3, 5, 4, 8), np.int16)
     array[0, 0, 0, :2] = 32767, -32768
@@ -197,7 +232,7 @@ def test_elements_survive_and_those_of_an_old_description_are_turned(tmp_path):
     [
         ("frame = 2", "frame = 1", "expected frame = 2 in adc.toml, got 1"),
         ("[radar]", "[antenna]", r"got \[antenna\]"),
-        ("slope", "slop", "with the keys of the documentation"),
+        ("slope", "slop", r"keys of the documentation in adc.toml, got \['slop'\] in \[settings\]"),
         ("slope = 60e12\n", "", "start_frequency, slope and sample_rate"),
         ("77e9", '"77 GHz"', "start_frequency"),
         ('file = "adc.npy"\n', "", "a file and"),

@@ -190,6 +190,41 @@ def test_other_sweeps_are_refused(tmp_path, frequencies, match):
         read_sweeps(tmp_path / "one.s2p")
 
 
+@pytest.mark.parametrize("order", ["falling", "shuffled"])
+def test_frequencies_in_another_order_are_sorted(tmp_path, order):
+    taken = np.arange(len(FREQUENCIES))[::-1]
+    if order == "shuffled":
+        taken = np.random.default_rng(1).permutation(taken)
+    swept = response(np.zeros(3), TARGET)
+    np.savez(tmp_path / "x.npz", s=swept[taken], f=FREQUENCIES[taken])
+    (tmp_path / "x.toml").write_text(
+        'frame = 2\n[data]\nfile = "x.npz"\nvariable = "s"\ndimensions = ["sample"]\n'
+        'conjugate = true\n[sweep]\nfrequencies = "f"\n'
+    )
+    found = read_sweeps(tmp_path / "x.toml")
+    assert found.beat[0, 0, 0].tolist() == pytest.approx(swept.conj().tolist())
+    touchstone(tmp_path / "x.s2p", swept[::-1], FREQUENCIES[::-1])
+    assert torch.allclose(read_sweeps(tmp_path / "x.s2p").beat, found.beat, atol=1e-12)
+
+
+@pytest.mark.parametrize("head", ["x, y, z", "X [m];Y [m];Z [m]", "z (m)\ty (m)\tx (m)"])
+def test_positions_as_other_programs_write_them(rail, head):
+    places = read_sweeps(rail).radar().positions
+    mark = next(mark for mark in (";", "\t", ", ") if mark in head)
+    rows = [row[::-1] if head.startswith("z") else row for row in RAIL]
+    lines = [head, *(mark.join(f"{value:.9f}" for value in row) for row in rows)]
+    text = "\n".join(lines)
+    (rail.parent / "rail.csv").write_text(text.replace(".", ",") if mark == ";" else text)
+    assert torch.allclose(read_sweeps(rail).radar().positions, places, atol=1e-8)
+
+
+@pytest.mark.parametrize("head", ["x [mm],y [mm],z [mm]", "0,0,0"])
+def test_positions_without_known_heads_are_refused(rail, head):
+    (rail.parent / "rail.csv").write_text(f"{head}\n0,0,0\n")
+    with pytest.raises(InputError, match=r"begin with a line x,y,z"):
+        read_sweeps(rail)
+
+
 def test_files_must_be_swept_alike(rail):
     touchstone(rail.parent / "empty.s2p", np.ones(101), FREQUENCIES + 1e6)
     with pytest.raises(InputError, match=r"frequencies of the first file in empty.s2p.*alike"):

@@ -59,6 +59,16 @@ def test_one_port_in_its_formats(tmp_path, options, row, expected):
     assert found.parameters[0, 0, 0].item() == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("order", [(3, 2, 1), (1, 2, 2)])
+def test_no_frequency_is_lost_in_two_ports(tmp_path, order):
+    """Falling ones, and one twice, as where two segments meet, are no noise data."""
+    rows = [f"{f} {f} 0 0 0 0 0 0 0" for f in order]
+    (tmp_path / "a.s2p").write_text("\n".join(["# Hz S RI R 50", *rows]))
+    found = load_touchstone(tmp_path / "a.s2p")
+    assert found.frequencies.tolist() == sorted(order)
+    assert found.parameters[:, 0, 0].tolist() == sorted(order)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -67,6 +77,7 @@ def test_one_port_in_its_formats(tmp_path, options, row, expected):
         ("a.s1p", "1 2", "a Touchstone file of 1 ports"),
         ("a.s1p", "", "a Touchstone file of 1 ports"),
         ("a.s1p", "1 two 3", "a Touchstone file of 1 ports"),
+        ("a.s1p", "1 0,5 0", "with points as decimal marks"),
     ],
 )
 def test_damaged_files_are_one_line(tmp_path, name, text, message):

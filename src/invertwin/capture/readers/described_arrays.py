@@ -16,7 +16,7 @@ import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
 from invertwin.checks import check_choice, checked_tensor
-from invertwin.constants import FRAME, OLD_AXES
+from invertwin.constants import FRAME, OLD_AXES, read_table
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.runtime.memory import require_memory
@@ -25,6 +25,7 @@ from invertwin.storage import untrusted
 from invertwin.storage.folders import replace_file
 from invertwin.storage.isolated_reader import read_isolated
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["described_arrays"]
 # The data tell these settings by their shape and kind.
 _KNOWN_FROM_DATA = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
 _KEYS = {
@@ -33,6 +34,7 @@ _KEYS = {
     "radar": {"board", "elevation", "azimuth", "tx_positions", "rx_positions"},
 }
 _PLACES = {"positions", "look_at", "tx_positions", "rx_positions", "range_center"}
+_POWER_SKEWNESS = 1.5  # of squares of normal numbers 2 to 2.8; of samples about 0
 _SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 
 
@@ -62,11 +64,7 @@ def load_described_board(
     if board is None:
         board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
         if (board is None) == (tx is None or rx is None):
-            raise InputError(
-                f"expected either a board or tx_positions and rx_positions in [radar] of {path}, "
-                f"got {'neither' if board is None else 'both'}; name a preset of "
-                "invertwin.radar.boards, or list the elements"
-            )
+            raise InputError(_TEXTS["board"].format(path, "neither" if board is None else "both"))
         if board is None:
             return element_array(tx, "TX", axes), element_array(rx, "RX", axes)
     return Mounting(
@@ -95,7 +93,8 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
         slope = 60e12
         sample_rate = 5e6
 
-    Dimensions that are left out have one element, ``virtual`` stands for tx and rx (tx-major).
+    Dimensions that are left out have one element, ``virtual`` stands for tx and rx (tx-major), and
+    ``iq`` is one of two numbers, I and Q.
     Files of MATLAB 7.3 are read in the order of dimensions that MATLAB shows. Transmitters and
     receivers are numbered from 1 unless ``transmit_order`` and ``receivers`` say otherwise; the
     dimension tx is in the order of sending.
@@ -116,8 +115,10 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     array = load_array(
         untrusted.named_file(path, str(data["file"])), data.get("variable"), trusted=trusted
     )
-    real = array.dtype.kind != "c"
     order = data.get("dimensions", list(CHIRP_DIMS))
+    real = array.dtype.kind != "c" and "iq" not in order
+    if real and _are_powers(array):
+        raise InputError(_TEXTS["powers"].format(path.name))
     samples = arrange_dimensions(array, order, len(given.get("transmit_order", [])) or None)
     if data.get("conjugate", False):
         samples = samples.conj()
@@ -131,14 +132,19 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     try:
         settings = ChirpSettings(**values)
     except TypeError as error:
-        raise InputError(
-            f"expected start_frequency, slope and sample_rate in [settings] of {path.name}, got "
-            f"others ({error}); add them in SI units"
-        ) from error
+        raise InputError(_TEXTS["settings"].format(path.name, error)) from error
     found = ChirpData(torch.from_numpy(samples), settings)
     if array.dtype.kind in "iu" or "bits" in given:
         found.warn_if_saturated()
     return found
+
+
+def _are_powers(array: np.ndarray) -> bool:
+    """Return True for numbers from zero up, most of them far below their mean, unlike samples."""
+    values = array.ravel()[:: max(1, array.size // 2**16)].astype(np.float64)
+    deviation = values - values.mean()
+    spread = float(np.mean(deviation**2))
+    return bool(values.min() >= 0 and np.mean(deviation**3) > _POWER_SKEWNESS * spread**1.5 > 0)
 
 
 def write_chirps(
@@ -159,10 +165,7 @@ def write_chirps(
     path = Path(path)
     target = path.parent / file
     if target.suffix not in _SUFFIXES or target.parent != path.parent:
-        raise InputError(
-            f"expected a file name that ends in {', '.join(_SUFFIXES)}, got {file!r}; "
-            "the data lie beside their description"
-        )
+        raise InputError(_TEXTS["ending"].format(", ".join(_SUFFIXES), file))
     s = data.settings
     samples = data.samples.detach().cpu().resolve_conj().numpy()
     array = np.ascontiguousarray(np.real(samples)) if s.real else samples
@@ -237,17 +240,14 @@ def load_description(
         description = tomllib.loads(text)
     frame = description.pop("frame", None)
     if frame not in (None, FRAME):
-        raise InputError(
-            f"expected frame = {FRAME} in {path.name}, got {frame!r}; give places along x forward, "
-            "y left, z up"
-        )
+        raise InputError(_TEXTS["frame"].format(FRAME, path.name, frame))
     for section, given in description.items():
         known = keys.get(section)
         if known is None or not isinstance(given, dict) or not set(given) <= known:
-            wrong = f"[{section}]" if known is None else f"{given!r} in [{section}]"
+            others = sorted(set(given) - known) if known and isinstance(given, dict) else given
+            wrong = f"[{section}]" if known is None else f"{others!r} in [{section}]"
             raise InputError(
-                f"expected sections {', '.join(keys)} with the keys of the documentation in "
-                f"{path.name}, got {wrong}; known keys: {sorted(known or keys)}"
+                _TEXTS["keys"].format(", ".join(keys), path.name, wrong, sorted(known or keys))
             )
     if frame is not None:
         return description, [0, 1, 2]
@@ -287,8 +287,10 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
                 f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
             ) from None
     if array.dtype.names is not None and len(array.dtype.names) == 2:
-        # Complex numbers as MATLAB 7.3 stores them: pairs of a real and an imaginary part.
-        pairs = np.stack([array[name] for name in array.dtype.names], axis=-1)
+        # Complex numbers as MATLAB 7.3 stores them: pairs named real and imag; others r, i or I, Q.
+        one, other = array.dtype.names
+        names = (other, one) if f"{one[:1]}{other[:1]}".lower() in ("ir", "qi") else (one, other)
+        pairs = np.stack([array[name] for name in names], axis=-1)
         wide = pairs.dtype.itemsize > 4
         array = pairs.astype("f8" if wide else "f4").view("c16" if wide else "c8")[..., 0]
     if array.dtype.kind not in "iufc":
@@ -322,23 +324,24 @@ def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) 
     Raises:
         InputError: names that do not fit.
     """
-    allowed = {*CHIRP_DIMS, "virtual"}
+    allowed = {*CHIRP_DIMS, "virtual", "iq"}
     valid = isinstance(order, list) and set(order) <= allowed and len(set(order)) == len(order)
     both = valid and "virtual" in order and {"tx", "rx"} & set(order)
     if not valid or both or "sample" not in order or len(order) != array.ndim:
         raise InputError(
-            f"expected dimensions as {array.ndim} different names of {sorted(allowed)} with "
-            f"sample, and virtual instead of tx and rx, got {order} for shape {array.shape}; "
-            "name the dimensions of the data in their order"
+            _TEXTS["dimensions"].format(array.ndim, sorted(allowed), order, array.shape)
         )
+    if "iq" in order:
+        parts = np.moveaxis(array, order.index("iq"), 0)
+        if len(parts) != 2 or array.dtype.kind == "c":
+            raise InputError(_TEXTS["iq"].format(array.dtype, array.shape))
+        array = parts[0] + np.array(1j, np.result_type(array.dtype, np.complex64)) * parts[1]
+        order = [name for name in order if name != "iq"]
     if "virtual" in order:
         axis = order.index("virtual")
         size = array.shape[axis]
         if transmitters is None or size % transmitters:
-            raise InputError(
-                f"expected transmit_order in [settings] that divides {size} virtual channels, got "
-                f"{transmitters or 'none'}; say which transmitters sent"
-            )
+            raise InputError(_TEXTS["virtual"].format(size, transmitters or "none"))
         shape = (*array.shape[:axis], transmitters, size // transmitters, *array.shape[axis + 1 :])
         array = array.reshape(shape)
         order = [*order[:axis], "tx", "rx", *order[axis + 1 :]]

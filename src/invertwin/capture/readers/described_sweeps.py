@@ -15,6 +15,7 @@ from invertwin.capture.capture import Capture
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.readers.touchstone import load_touchstone
 from invertwin.checks import checked_tensor
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
@@ -23,6 +24,7 @@ from invertwin.storage import untrusted
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 """Ending of a Touchstone file."""
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["described_sweeps"]
 _PARAMETER = re.compile(r"S([1-9])([1-9])")
 _KEYS = {
     "data": {"file", "files", "variable", "dimensions", "conjugate"},
@@ -121,7 +123,8 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     else:
         beat = _load_sweep_array(files, data, len(tx.positions), trusted)
         frequencies = _load_frequencies(source, sweep, beat.shape[-1])
-    frequencies, beat = _select_band(frequencies, beat, sweep.get("band"))
+    frequencies, order = frequencies.sort(stable=True)
+    frequencies, beat = _select_band(frequencies, beat[..., order], sweep.get("band"))
     start, step = _frequency_spacing(frequencies)
     waveform = SteppedFrequency(start, step, len(frequencies), sweep.get("dwell", _DWELL))
     places = _load_positions(source, radar.get("positions"), len(beat))[:, axes]
@@ -137,16 +140,10 @@ def _select_band(
     if band is None:
         return frequencies, beat
     if not isinstance(band, list) or len(band) != 2 or not float(band[0]) < float(band[1]):
-        raise InputError(
-            f"sweep.band: expected its lowest and highest frequency [Hz], got {band!r}; "
-            "write band = [2e9, 6e9]"
-        )
+        raise InputError(_TEXTS["band"].format(band))
     inside = (frequencies >= band[0]) & (frequencies <= band[1])
     if inside.sum() < 2:
-        raise InputError(
-            f"sweep.band: expected a band that holds two frequencies or more of "
-            f"{frequencies.min():.4g} to {frequencies.max():.4g} Hz, got {band!r}; widen it"
-        )
+        raise InputError(_TEXTS["empty_band"].format(frequencies.min(), frequencies.max(), band))
     return frequencies[inside], beat[..., inside]
 
 
@@ -155,18 +152,12 @@ def _load_sweep_array(
 ) -> Tensor:
     """Load the sweeps of an array file, [frame, tx, rx, sample]."""
     if len(files) > 1:
-        raise InputError(
-            f"expected one data file or Touchstone files, got {len(files)} of {files[0].name}; "
-            "put the arrays into one"
-        )
+        raise InputError(_TEXTS["several_files"].format(len(files), files[0].name))
     array = described_arrays.load_array(files[0], data.get("variable"), trusted=trusted)
     order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
     samples = torch.from_numpy(described_arrays.arrange_dimensions(array, order, tx_count))
     if samples.shape[1] != 1:
-        raise InputError(
-            f"expected one sweep a frame, got {samples.shape[1]} chirps; name that dimension "
-            '"frame"'
-        )
+        raise InputError(_TEXTS["several_chirps"].format(samples.shape[1]))
     return (samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]).resolve_conj()
 
 
@@ -185,20 +176,14 @@ class _SweepFile:
         if beside.suffix == ".npy":
             return untrusted.read_npy(beside)
         if TOUCHSTONE.fullmatch(self.file.suffix) or self.file.suffix == ".npy":
-            raise InputError(
-                f"expected numbers, or the name of a .csv or .npy file, got {given!r}; "
-                f"{self.file.name} has no variables"
-            )
+            raise InputError(_TEXTS["no_variables"].format(given, self.file.name))
         return described_arrays.load_array(self.file, given, trusted=self.trusted)
 
 
 def _find_data_files(path: Path, data: dict[str, Any]) -> list[Path]:
     """The data files of a description, at least one."""
     if ("file" in data) == ("files" in data):
-        raise InputError(
-            f"expected either file or files in [data], got {'both' if data else 'neither'}; "
-            "name what holds the samples"
-        )
+        raise InputError(_TEXTS["files"].format("both" if data else "neither"))
     if "file" in data:
         return [untrusted.named_file(path, str(data["file"]))]
     named = data["files"]
@@ -235,10 +220,7 @@ def _load_parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
     match = _PARAMETER.fullmatch(name)
     out, into = (int(port) for port in match.groups()) if match else (0, 0)
     if not (1 <= out <= ports and 1 <= into <= ports):
-        raise InputError(
-            f"expected a parameter such as S11 of the {ports} ports of {file.name}, got {name!r}; "
-            "S21 is what port 2 receives of what port 1 sends"
-        )
+        raise InputError(_TEXTS["parameter"].format(ports, file.name, name))
     return found.frequencies, found.parameters[:, out - 1, into - 1]
 
 
@@ -247,9 +229,9 @@ def _load_response(file: Path, sweep: dict[str, Any], frequencies: Tensor) -> Te
     own, response = _load_parameter(file, sweep)
     if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
         raise InputError(
-            f"expected the {len(frequencies)} frequencies of the first file in {file.name}, got "
-            f"{len(own)} from {float(own[0]):g} to {float(own[-1]):g} Hz; sweep all files alike, "
-            "the background too"
+            _TEXTS["unlike_sweeps"].format(
+                len(frequencies), file.name, len(own), float(own[0]), float(own[-1])
+            )
         )
     return response
 
@@ -260,10 +242,7 @@ def _load_frequencies(source: _SweepFile, sweep: dict[str, Any], samples: int) -
         given = np.ravel(source.values(sweep["frequencies"]))
         return checked_tensor(given, (samples,), "frequencies", "give one in Hz per sample")
     if not {"start_frequency", "step"} <= set(sweep):
-        raise InputError(
-            "expected frequencies, or start_frequency and step, in [sweep], got neither; add them "
-            "in Hz"
-        )
+        raise InputError(_TEXTS["no_frequencies"])
     count = torch.arange(samples, dtype=torch.float64)
     return float(sweep["start_frequency"]) + float(sweep["step"]) * count
 
@@ -280,21 +259,14 @@ def _frequency_spacing(frequencies: _Frequencies) -> tuple[float, float]:
     line = first + step * torch.arange(count, dtype=torch.float64)
     if not (step > 0 and (frequencies - line).abs().max() <= _SPACING_TOLERANCE * step):
         steps = frequencies.diff()
-        raise InputError(
-            f"expected ascending, equally spaced frequencies, got steps from "
-            f"{float(steps.min()):g} to {float(steps.max()):g} Hz; sweep linearly in one segment, "
-            "or interpolate the samples"
-        )
+        raise InputError(_TEXTS["spacing"].format(float(steps.min()), float(steps.max())))
     return first, step
 
 
 def _load_positions(source: _SweepFile, given: Any, frames: int) -> Float64[Tensor, "frame 3"]:
     """The radar's position in every frame."""
     if given is None and frames > 1:
-        raise InputError(
-            f"expected positions of {frames} frames in [radar], got none; say where the antennas "
-            "were at each"
-        )
+        raise InputError(_TEXTS["no_positions"].format(frames))
     if given is None:
         return torch.zeros(1, 3, dtype=torch.float64)
     if isinstance(given, str) and given.lower().endswith(".csv"):
@@ -309,8 +281,16 @@ def _read_position_rows(file: Path) -> list[list[float]]:
     """x, y, z of a CSV file whose first line says which column is which."""
     what = "lines of x,y,z [m] after a line of these heads"
     text = untrusted.read_text(file, what)
-    with untrusted.convert_read_errors(file, what, "write them with points as decimal marks"):
-        return [[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(text.splitlines())]
+    with untrusted.convert_read_errors(file, what, "begin with a line x,y,z"):
+        head, *lines = text.splitlines()
+        mark = next((m for m in ";\t" if m in head), ",")
+        if mark == ";":  # where commas are decimal marks
+            lines = [line.replace(",", ".") for line in lines]
+        names = [
+            re.sub(r"[\[(]m[\])]$", "", name.strip()).strip().lower() for name in head.split(mark)
+        ]
+        table = csv.DictReader(lines, names, delimiter=mark)
+        return [[float(row[axis]) for axis in "xyz"] for row in table]
 
 
 def _parse_point(radar: dict[str, Any], name: str, axes: list[int]) -> Float64[Tensor, "3"] | None:

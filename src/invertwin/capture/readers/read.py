@@ -52,7 +52,7 @@ def read(
     if ending not in (".bin", ".json"):
         raise InputError(
             "expected a recording that ends in .bin, .setup.json, .toml, .s1p, .s2p or .nc, got "
-            f"{path}; convert it"
+            f"{path}; describe .npy, .npz, .h5, .hdf5 and .mat files in a .toml, convert others"
         )
     if board is None:
         raise InputError(

@@ -39,7 +39,7 @@ class Touchstone:
     """Scattering parameters of a network analyser.
 
     Attributes:
-        frequencies: [Hz].
+        frequencies: [Hz], ascending.
         parameters: S of every frequency, [frequency, port out, port in].
         resistance: reference resistance [Ω], of the first port where they differ.
     """
@@ -84,7 +84,7 @@ def load_touchstone(file: str | Path) -> Touchstone:
         raise InputError(f"expected a Touchstone file such as .s1p or .s2p, got {path.name}")
     what = f"a Touchstone file of {ports[1]} ports" if ports[1] else "a Touchstone file"
     text = read_text(path, what)
-    with convert_read_errors(path, what):
+    with convert_read_errors(path, what, "export it again, with points as decimal marks"):
         lines = [line.split("!")[0].strip() for line in text.splitlines()]
         options = next((line[1:].upper().split() for line in lines if line.startswith("#")), [])
         unit, kind, resistance = _parse_option_line(options)
@@ -102,6 +102,7 @@ def load_touchstone(file: str | Path) -> Touchstone:
     # Two ports are listed as S11, S21, S12, S22; others row by row.
     if count == 2 and keywords.get("two-port data order") != ["12_21"] and matrix.shape[1] == 4:
         matrix = matrix[:, [0, 2, 1, 3]]
+    values, matrix = (part[np.argsort(values[:, 0], kind="stable")] for part in (values, matrix))
     filled = _fill_matrix(matrix, count, keywords.get("matrix format", ["full"])[0].lower())
     return Touchstone(torch.from_numpy(values[:, 0] * unit), torch.from_numpy(filled), resistance)
 
@@ -127,8 +128,9 @@ def _read_version_1(lines: list[str], count: int) -> np.ndarray:
         raise ValueError(f"{len(numbers)} numbers, no multiple of {width}")
     rows = np.array(numbers[: len(numbers) // width * width]).reshape(-1, width)
     # Noise data of two ports follow; their frequencies begin anew.
-    falls = np.nonzero(np.diff(rows[:, 0]) <= 0)[0]
-    return rows[: falls[0] + 1] if len(falls) else rows
+    way = np.diff(rows[:, 0]) * np.diff(rows[:2, 0])
+    falls = np.nonzero(way <= 0 if len(numbers) % width else way < 0)[0]
+    return rows[: falls[0] + 1] if len(falls) and count == 2 else rows
 
 
 def _read_version_2(keywords: dict[str, list[str]]) -> tuple[int, np.ndarray]:

@@ -19,12 +19,14 @@ from invertwin.capture.ti import layouts
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.checks import check_choice
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.runtime.memory import require_memory
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import existing_file, safe_reader
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["dca1000"]
 _WORD = np.dtype("<i2")
 
 
@@ -46,10 +48,7 @@ def read_recording(
     known = settings if isinstance(settings, ChirpSettings) else read_settings(settings or path)
     if lanes is not None:
         if known.lanes not in (None, lanes):
-            raise InputError(
-                f"expected the {known.lanes} LVDS lanes of the device in the settings, got "
-                f"lanes={lanes}; leave lanes out"
-            )
+            raise InputError(_TEXTS["lanes"].format(known.lanes, lanes))
         known = replace(known, lanes=lanes)
     return read_samples(recorded_files(path), known)
 
@@ -94,10 +93,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
     size = sum(part.stat().st_size for part in paths)
     name = paths[0].name if paths else "nothing"
     if size % _WORD.itemsize:
-        raise InputError(
-            f"expected 16-bit samples in {name}, got an odd number of bytes ({size}); "
-            "the file is damaged or no raw recording, copy it again"
-        )
+        raise InputError(_TEXTS["odd_bytes"].format(name, size))
     require_memory(10.0 * size, f"the samples of {name}", "split the recording")
     words = np.frombuffer(b"".join(part.read_bytes() for part in paths), _WORD)
     if settings.bits < 16:
@@ -130,15 +126,9 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
     parts = np.stack([samples.real, samples.imag], axis=-1)
     top = 2 ** (settings.bits - 1) - 1
     if (parts != parts.round()).any() or parts.max() > top or parts.min() < -top - 1:
-        raise InputError(
-            f"expected whole counts from {-top - 1} to {top}, got others; "
-            "scale and round the samples with adc_counts(beat, settings, full_scale)"
-        )
+        raise InputError(_TEXTS["counts"].format(-top - 1, top))
     if settings.real and parts[..., 1].any():
-        raise InputError(
-            "expected samples without imaginary part from a real ADC, got some with; "
-            "take their real part or set real=False"
-        )
+        raise InputError(_TEXTS["imaginary"])
     words = np.zeros((len(parts), layouts.frame_words(settings)), _WORD)
     words[:, _word_indices(settings)] = parts[..., :1] if settings.real else parts
     with replace_file(path) as part:
@@ -147,10 +137,7 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
 
 def _check_layout(settings: ChirpSettings) -> None:
     if settings.lanes is None:
-        raise InputError(
-            "expected settings with 2 or 4 LVDS lanes, got none; set lanes: 4 for xWR12xx and "
-            "xWR14xx, 2 for xWR16xx, xWR18xx and xWR68xx"
-        )
+        raise InputError(_TEXTS["no_lanes"])
     why = layouts.layout_error(settings)
     if why is not None:
         raise InputError(f"expected {why}")
@@ -172,19 +159,14 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
         wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
         advice = layouts.format_advice(others)
         raise InputError(
-            f"expected the recording of its settings in {name} ({wanted} bytes), got {size} "
-            f"bytes{' whose chirps break elsewhere' if exact else ''}; {advice}"
+            _TEXTS["contradiction"].format(
+                name, wanted, size, " whose chirps break elsewhere" if exact else "", advice
+            )
         )
     if not exact and expected is not None and not cut:
-        raise InputError(
-            f"expected {expected * frame} bytes in {name} ({expected} frames of {frame}), got "
-            f"{size}; no one or two changes of the settings fit, find those of this recording"
-        )
+        raise InputError(_TEXTS["size"].format(expected * frame, name, expected, frame, size))
     if not frames:
-        raise InputError(
-            f"expected at least one frame of {frame} bytes in {name}, got {size} bytes; "
-            "nothing was recorded, or the settings are those of another recording"
-        )
+        raise InputError(_TEXTS["no_frame"].format(frame, name, size))
     missing = ""
     if rest:
         missing = (

@@ -77,6 +77,8 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         points = radars.detect_points(chirps.beat, radar, grid, chirps.chirps, options.frame)
     elif "beat" in capture.dataset:
         points = radars.detect_points(capture.beat[:, None], radar, grid, None, options.frame)
+    if points is not None and options.range_min is None and is_far_only(points, recording):
+        said.append("reading: " + load_texts("notes")["far_only"])
     if radar.frame_count > 1:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
@@ -101,6 +103,18 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
         above = plotting.from_above(of_frame, grid, one, {"detections": points.position})
         parts.insert(1, save_picture(folder, "above", above, "From above", "above"))
     return report.write_report(folder, metrics, title, status, parts, **told), answer
+
+
+def is_far_only(points: radars.PointCloud, recording: AnyRecording) -> bool:
+    """Return True for I and Q of echoes that all lie beyond half of the unambiguous range.
+
+    Args:
+        points: Points of a frame.
+        recording: The recording.
+    """
+    real = isinstance(recording, captures.ChirpCapture) and recording.real
+    near = points.range <= 0.5 * recording.max_range
+    return bool(len(points)) and not (real or near.any() or recording.radar().origins.any())
 
 
 def describe_peak(metrics: dict[str, Any]) -> str:
