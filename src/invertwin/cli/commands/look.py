@@ -78,7 +78,7 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     elif "beat" in capture.dataset:
         points = radars.detect_points(capture.beat[:, None], radar, grid, None, options.frame)
     if points is not None and options.range_min is None and is_far_only(points, recording):
-        said.append("reading: " + load_texts("notes")["far_only"])
+        said.append("reading: " + report.load_texts("notes")["far_only"])
     if radar.frame_count > 1:
         profiles = capture.spectrum(replace(grid, u_count=1, v_count=1))
         times = torch.arange(radar.frame_count)
