@@ -1,6 +1,7 @@
 """Nothing in the docs is unexecuted: snippets run, examples run, names and links exist."""
 
 import ast
+import html
 import importlib
 import inspect
 import json
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -225,6 +227,23 @@ def test_examples_run(script, tmp_path):
     run([str(script)], tmp_path)
     for name in WRITES[script.name]:
         assert (tmp_path / "out" / "examples" / name).stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_the_notebook_for_hosted_machines_shows_the_demo(tmp_path, monkeypatch):
+    """Its lines of the shell, but pip, and its last cell."""
+    shown = SimpleNamespace(HTML=lambda data: data)  # as notebooks have it
+    monkeypatch.setitem(sys.modules, "IPython.display", shown)
+    book = json.loads((REPOSITORY / "examples" / "colab.ipynb").read_text("utf-8"))
+    texts = ["".join(cell["source"]) for cell in book["cells"] if cell["cell_type"] == "code"]
+    assert "%pip install --quiet invertwin" in texts[0]
+    for line in (text for text in texts if text.startswith("!invertwin ")):
+        run(["-m", "invertwin", *line.split()[1:]], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    body, _, last = texts[-1].rpartition("\n")
+    names: dict = {}
+    exec(body, names)
+    assert "loss" in html.unescape(eval(last, names))
 
 
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.name)
