@@ -378,10 +378,7 @@ def intersection_curve_paths(
 
 
 def require_no_interreflection(
-    walker: RandomWalk,
-    curves: IntersectionCurves,
-    depth: int,
-    seed: int,
+    walker: RandomWalk, curves: IntersectionCurves, depth: int, seed: int
 ) -> None:
     """Refuse paths between surfaces that meet, whose derivative does not converge.
 
@@ -389,8 +386,7 @@ def require_no_interreflection(
     scatter it.
 
     Args:
-        fixed: detached inputs.
-        walker: random walk that extends the paths.
+        walker: random walk that extends the paths, with detached inputs.
         curves: intersection curves.
         depth: most vertices of a path.
         seed: seed of the points on the curves.
