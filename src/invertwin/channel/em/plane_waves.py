@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -88,7 +88,7 @@ def polarisations(direction: Vectors, up: Float64[Tensor, "3"]) -> Float64[Tenso
     return torch.stack([cross(horizontal, direction), horizontal], dim=-2)
 
 
-def reflect_vectors(vector: Tensor, normal: Vectors) -> Tensor:
+def reflect_vectors(vector: Tensor, normal: Float[Tensor, "*row 3"]) -> Tensor:
     """Reflect vectors at planes: v − 2(n·v)n.
 
     Args:
