@@ -401,3 +401,15 @@ def test_a_seam_is_found_again_where_objects_slide():
     other = topology_of(parts, slid)
     assert other is not shape
     assert int((other.edge_faces >= 0).sum()) != int((shape.edge_faces >= 0).sum())
+
+
+def test_soups_that_share_their_faces_have_seams_of_their_own():
+    """The topology of one is kept for another one only while its seams are closed."""
+    closed = soup(box(0.4), torch.float64)
+    apart = closed.vertices.reshape(-1, 3, 3)
+    apart = (apart + 0.05 * apart.mean(1, keepdim=True)).reshape(-1, 3)
+    first = topology_of([closed])
+    assert not first.open_objects
+    assert topology_of([Mesh(2 * closed.vertices, closed.faces)]) is first
+    second = topology_of([Mesh(apart, closed.faces)])
+    assert second.open_objects == {0}

@@ -68,6 +68,7 @@ class Topology:
             )
         #: Vertices of triangles, where vertices at one place count as one.
         self.welded_faces: Int64[Tensor, "f 3"] = torch.from_numpy(welded)
+        self._built = faces, vertices
         tables = edge_tables(edges, places, face_object.numpy())
         # Of each object, side by side: samples that follow this order are spread over its surface.
         start, end = tables[0].T
@@ -106,6 +107,27 @@ class Topology:
             return points
         moved = points.new_zeros(len(vertex), 3).index_add(0, row, weight[:, None] * points[column])
         return points.index_put((vertex,), moved)
+
+    @cached_property
+    def _seams(self) -> tuple[Tensor, Tensor]:
+        """Vertices of triangles, and those of the same object that they count as."""
+        (faces, _), welded, owner = self._built, self.welded_faces, self.vertex_object
+        seam = (welded != faces) & (owner[welded] == owner[faces])
+        return faces[seam], welded[seam]
+
+    def keeps_seams(self, parts: Sequence[Float64[Tensor, "_ 3"]]) -> bool:
+        """Test that vertices of an object that count as one are as close as they were.
+
+        Args:
+            parts: positions of each object in its own frame [m].
+        """
+        one, other = self._seams
+        if not len(one):
+            return True
+        points = torch.cat([strip_derivatives(part) for part in parts])
+        before, now = (place[one] - place[other] for place in (self._built[1], points))
+        tolerance = mesh_topology.CRACK_TOLERANCE * (points.amax(0) - points.amin(0)).norm()
+        return bool((now.norm(dim=1) <= before.norm(dim=1) + tolerance).all())
 
     @cached_property
     def face_edges(self) -> Int64[Tensor, "f 3"]:
@@ -211,8 +233,10 @@ def topology_of(
         # The entry holds the face tensors, so that their ids stay theirs.
         key = (VARIANTS[backend()], groups.tobytes(), *map(id, faces), *sizes)
         _, known, found = _topologies.get(key, (faces, bodies, None))
-        # The seams of a group stay as they are while its objects move as one body.
-        if found is None or not all(is_one_motion(known[g], bodies[g]) for g in bodies):
+        # The seams of a group stay as they are while its objects move as one body, those of an
+        # object until they open.
+        rests = all(is_one_motion(known[g], bodies[g]) for g in bodies)
+        if found is None or not rests or not found.keeps_seams([one.vertices for one in meshes]):
             starts = [0, *itertools.accumulate(sizes)]
             fixed = [strip_derivatives(mesh.vertices) for mesh in meshes]
             own = [strip_derivatives(f) + start for f, start in zip(faces, starts, strict=False)]
