@@ -52,6 +52,7 @@ LISTED = {
     "radar/processing/detection.py:point_cloud": "SciPy's filter of maxima",
     "radar/processing/reflectors.py:detect_points": "points are found one by one",
     "radar/processing/reflectors.py:format_points_csv": "text",
+    "radar/processing/vital_signs.py:estimate_vital_signs": "SciPy's filters of one bin",
     "links/listing.py:path_table": "text",
     "inversion/loss.py:SpectrumLoss._differentiate_gain": "gain and noise, found on the CPU",
     "inversion/loss.py:Objective.curvature": "one row per parameter, and these are on the CPU",

@@ -125,6 +125,14 @@ SURROGATE = rd.Surrogate(range_width=3.0, angle_width=1.5)
 AIRY = rd.Surrogate(angle_kernel="airy")
 BIASED = replace(RADAR, range_bias=float64(0.03))
 
+
+def vital_signs(move: Move) -> list[Tensor]:
+    chest = torch.polar(torch.ones(400), torch.linspace(0, 60, 400).sin()).to(torch.complex128)
+    profiles = torch.outer(chest, torch.arange(GRID.range_count) == 2)
+    found = rd.estimate_vital_signs(move(profiles), RADAR, GRID, interval=0.1)
+    return [found.times, found.displacement]
+
+
 CASES: dict[str, Case] = {
     "Impairments.apply": lambda move: impair(move, "apply"),
     "Impairments.record": lambda move: impair(move, "record"),
@@ -170,6 +178,10 @@ CASES: dict[str, Case] = {
     "dirichlet": lambda move: rd.dirichlet(CHIRP, move(torch.linspace(-1, 1, 5).double())),
     "doppler_maps": lambda move: rd.doppler_maps(move(train()), RADAR, GRID, TRAIN),
     "doppler_snapshots": lambda move: rd.doppler_snapshots(move(train()), RADAR, GRID, TRAIN, 0),
+    "estimate_displacement": lambda move: list(
+        rd.estimate_displacement(move(profile()[0, :, 0, 0]), RADAR)
+    ),
+    "estimate_vital_signs": vital_signs,
     "exact_spectrum": lambda move: rd.exact_spectrum(move(ramp()), RADAR, GRID),
     "find_peak": lambda move: float64(list(vars(rd.find_peak(move(power()[0]), GRID)).values())),
     "format_points_csv": lambda move: torch.tensor(

@@ -97,7 +97,7 @@ def estimate_vital_signs(
         )
     moved, roundness, variance = estimate_displacement(profile.detach().flatten(1), radar)
     best = int((roundness * variance).argmax())
-    displacement = signal.detrend(moved[:, best].numpy())
+    displacement = signal.detrend(moved[:, best].cpu().numpy())
     is_arc = float(roundness[best]) > _LEAST_ROUNDNESS
     times, rest = interval * np.arange(count), displacement
     breathing = _find_oscillation(rest, interval, _BREATHING_BAND) if is_arc else None
@@ -106,7 +106,7 @@ def estimate_vital_signs(
         rest = rest - _fit_sines(rest, times, harmonics)[0]
     heart = _find_oscillation(rest, interval, _HEART_BAND) if is_arc else None
     place = float(grid.ranges[best % grid.range_count])
-    tensors = torch.from_numpy(times), torch.from_numpy(displacement)
+    tensors = (torch.from_numpy(x).to(profile.device) for x in (times, displacement))
     return VitalSigns(place, *tensors, breathing, heart)
 
 
