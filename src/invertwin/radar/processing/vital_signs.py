@@ -106,8 +106,8 @@ def estimate_vital_signs(
         rest = rest - _fit_sines(rest, times, harmonics)[0]
     heart = _find_oscillation(rest, interval, _HEART_BAND) if is_arc else None
     place = float(grid.ranges[best % grid.range_count])
-    tensors = (torch.from_numpy(x).to(profile.device) for x in (times, displacement))
-    return VitalSigns(place, *tensors, breathing, heart)
+    at, seen = (torch.from_numpy(x).to(profile.device) for x in (times, displacement))
+    return VitalSigns(place, at, seen, breathing, heart)
 
 
 def estimate_displacement(
