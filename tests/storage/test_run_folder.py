@@ -12,7 +12,7 @@ import pytest
 from invertwin.cli.run_file import to_toml, validate_run
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
-from invertwin.storage.folders import LOCK, MANIFEST, UNFINISHED
+from invertwin.storage.folders import LOCK, MANIFEST, PARTS, UNFINISHED
 from invertwin.storage.run_folder import open_run, to_json_value
 
 
@@ -306,3 +306,13 @@ def test_metrics_are_plain_json(tmp_path):
         "c": [[1.0, 0.0], [0.0, 1.0]],
         "d": str(tmp_path),
     }
+
+
+def test_a_part_that_was_never_written_leaves_no_folder(tmp_path):
+    """A search that is not interrupted writes no checkpoint; the folder may be overwritten."""
+    out = tmp_path / "out"
+    for flags in ({}, {"overwrite": True}):
+        with open_run(out, {"a": to_toml(make_run())}, **flags) as folder:
+            assert not folder.file(f"{PARTS}/search.json").exists()
+            folder.write_bytes("metrics.json", b"{}")
+        assert not (out / UNFINISHED).exists()

@@ -127,7 +127,9 @@ class RunFolder:
     def _finish(self) -> None:
         work = self._manifest.unfinished
         assert work is not None
-        there = [name for name in work.files if (self.path / folders.UNFINISHED / name).exists()]
+        # Parts stay listed, so that their folder goes even if nothing was ever written there.
+        inside, parts = self.path / folders.UNFINISHED, f"{folders.PARTS}/"
+        there = [one for one in work.files if one.startswith(parts) or (inside / one).exists()]
         done = work.model_copy(update={"files": there, "complete": True})
         manifest = self._manifest.model_copy(update={"unfinished": done})
         folders.save_manifest(self.path, manifest)
