@@ -19,6 +19,7 @@ from invertwin.cli.commands.dataset import make_sample_run, make_shard
 from invertwin.cli.exact_signals import warn_if_aliased
 from invertwin.cli.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema import build
+from invertwin.cli.schema.motion_tables import build_moving_scene
 from invertwin.cli.schema.shape_tables import joint_positions
 from invertwin.cli.schema.variation import parse_key_path, set_values
 from invertwin.datasets import SampleDataset, object_labels
@@ -269,10 +270,10 @@ def test_samples_hold_micro_doppler(tmp_path):
 
 def test_what_moves_beyond_the_limit_of_range_rates_is_told(tmp_path, monkeypatch, capsys):
     run = validate_run(tomllib.loads(RUN), ANYWHERE)
-    scene, radar = build.true_scene(run), build.radar(run.radar)
+    moving, radar = build_moving_scene(run, build.true_scene(run)), build.radar(run.radar)
     with pytest.warns(PhysicsWarning, match=r"up to 1.00 m/s, beyond 0.97 m/s, and appears"):
-        warn_if_aliased(run, scene, radar, Chirps(64, 1e-3))
-    warn_if_aliased(run, scene, radar, Chirps(64, 0.9e-3))  # no warning: ±1.07 m/s
+        warn_if_aliased(moving, radar, Chirps(64, 1e-3))
+    warn_if_aliased(moving, radar, Chirps(64, 0.9e-3))  # no warning: ±1.07 m/s
 
 
 def test_a_sample_is_simulated_again_from_its_own_run_file(whole, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar import Chirps, Radar
-from invertwin.scene import Scene
+from invertwin.scene import MovingScene, Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
 
 _INSTANTS = 9  # of a frame, at which range rates are compared with their limit
@@ -38,16 +38,16 @@ def simulate_chirp_beats(run: RunFile, scene: Scene, radar: Radar, chirps: Chirp
     front = sensors.impairments(run.impairments, data)
     table = require_section(run, "chirps", "several ramps a frame")
     depth = data.depth if data.mirrors else 1
-    warn_if_aliased(run, scene, radar, chirps)
     moving, how = build_moving_scene(run, scene), _settings(run, scene, depth)
+    warn_if_aliased(moving, radar, chirps)
     how |= {"retrace": table.retrace, "visibility_every": table.visibility_every}
     with prefix_errors("chirps"), torch.no_grad():
         return simulate_chirps(moving, radar, chirps, impairments=front, **how)
 
 
-def warn_if_aliased(run: RunFile, scene: Scene, radar: Radar, chirps: Chirps) -> None:
+def warn_if_aliased(moving: Scene | MovingScene, radar: Radar, chirps: Chirps) -> None:
     """Warn if a point, such as one of a limb, exceeds the largest unambiguous range rate."""
-    moving = build_moving_scene(run, scene)
+    scene = moving if isinstance(moving, Scene) else moving.scene
     motion = moving.advance if isinstance(moving, Scene) else moving
     names = {name for name, thing in scene.objects.items() if thing.velocity is not None}
     names |= set(getattr(moving, "motions", ()))

@@ -20,8 +20,7 @@ from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact, wa
 from invertwin.cli.inputs import DATASET_SECTIONS
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
-from invertwin.cli.schema import RunFile, build
-from invertwin.cli.schema.motion_tables import joint_positions_at_start, scene_at_start
+from invertwin.cli.schema import RunFile, build, motion_tables
 from invertwin.cli.schema.variation import draw_sample
 from invertwin.datasets import SampleDataset, labels, shards
 from invertwin.errors import InputError, PhysicsWarning
@@ -133,7 +132,8 @@ def run_dataset(
         scene, sensor = _build_sample(own)
         require_resources(own, scene, {"": sensor})
         if own.chirps is not None:
-            warn_if_aliased(own, scene, sensor.radar, own.chirps.build())
+            moving, chirps = motion_tables.build_moving_scene(own, scene), own.chirps.build()
+            warn_if_aliased(moving, sensor.radar, chirps)
     found = {number: _read_finished_shard(folder, number) for number, _, _ in wanted}
     missing = [row for row in wanted if found[row[0]] is None]
     text = to_toml(run)
@@ -193,11 +193,13 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         arrays = _simulate_signals(own, scene, sensor, table)
         begun, chirps = scene, own.chirps and own.chirps.build()  # labels refer to the start
         if chirps is not None:
-            begun = scene_at_start(own, scene, float(chirps.times(sensor.radar.shape[1]).max()))
+            last = float(chirps.times(sensor.radar.shape[1]).max())
+            begun = motion_tables.scene_at_start(own, scene, last)
         seen = labels.triangle_visibility(begun, sensor.radar)
     if table.masks:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
-    objects = labels.object_labels(begun, seen, table.classes, joint_positions_at_start(own, begun))
+    joints = motion_tables.joint_positions_at_start(own, begun)
+    objects = labels.object_labels(begun, seen, table.classes, joints)
     told = {"index": index, "objects": objects, "radar": labels.radar_labels(sensor.radar)}
     files = {f"{name}.npy": shards.npy_bytes(array) for name, array in arrays.items()}
     text = json.dumps(told, ensure_ascii=False, allow_nan=False)

@@ -105,9 +105,8 @@ def estimate_vital_signs(
         harmonics = breathing.frequency * np.arange(1, int(_HEART_BAND[1] / breathing.frequency))
         rest = rest - _fit_sines(rest, times, harmonics)[0]
     heart = _find_oscillation(rest, interval, _HEART_BAND) if is_arc else None
-    place = float(grid.ranges[best % grid.range_count])
     at, seen = (torch.from_numpy(x).to(profile.device) for x in (times, displacement))
-    return VitalSigns(place, at, seen, breathing, heart)
+    return VitalSigns(float(grid.ranges[best % grid.range_count]), at, seen, breathing, heart)
 
 
 def estimate_displacement(
@@ -132,8 +131,7 @@ def estimate_displacement(
     xx, yy, xy, xs, ys = (part.mean(0) for part in (x * x, y * y, x * y, x * square, y * square))
     twice = 2 * (xx * yy - xy * xy).clamp_min(_TINY)
     away = off - torch.complex((yy * xs - xy * ys) / twice, (xx * ys - xy * xs) / twice)
-    phase = (away[1:] * away[:-1].conj()).angle().cumsum(0)
-    phase = torch.cat([torch.zeros_like(phase[:1]), phase])
+    phase = torch.nn.functional.pad((away[1:] * away[:-1].conj()).angle().cumsum(0), (0, 0, 1, 0))
     variance = square.mean(0)
     roundness = variance / away.abs().var(0, correction=0).clamp_min(_TINY)
     return -phase * radar.waveform.wavelength / (4 * math.pi), roundness, variance
