@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Int64, Num
 from torch import Tensor
 
+from invertwin.checks import strip_derivatives
+
 Table = TypeVar("Table", bound="Rows")
 
 
@@ -36,6 +38,15 @@ def concatenate_rows(parts: Sequence[Table], **columns: Tensor) -> Table:
     names = [n for n, v in vars(parts[0]).items() if isinstance(v, Tensor) and n not in columns]
     joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **joined, **columns)
+
+
+def strip_rows(table: Table) -> Table:
+    """Return a table of tensors without derivatives.
+
+    Args:
+        table: its tensors may have derivatives of any kind.
+    """
+    return replace(table, **{name: strip_derivatives(value) for name, value in vars(table).items()})
 
 
 def bound_groups(

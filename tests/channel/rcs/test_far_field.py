@@ -48,6 +48,7 @@ from invertwin.scene import (
 )
 from invertwin.scene.material.fresnel import fresnel_coefficients
 from invertwin.scene.material.slab import slab_coefficients
+from invertwin.scene.mesh import concatenate_meshes
 from invertwin_studies.dihedral_moments import strip_section_te, strip_section_tm
 from scenes import float64
 
@@ -329,6 +330,38 @@ def test_creases_between_facets_of_a_flat_or_smooth_surface_are_no_edges():
         for n in (1, 3)
     )
     assert torch.allclose(fine, coarse, rtol=1e-6)
+
+
+@pytest.mark.parametrize("corner", [0.0, 0.02], ids=["across a face", "along two edges"])
+def test_partitions_in_a_body_do_not_diffract(corner):
+    """Their own edges lie on its faces, and edges of three faces diffract as those of two."""
+    body = box((0.04, 0.06, 0.05))
+    ends = [[-corner, -0.03], [corner, 0.03]]
+    rectangle = float64(
+        [[*ends[k], z] for k, z in ((0, -0.025), (1, -0.025), (1, 0.025), (0, 0.025))]
+    )
+    partition = Mesh(rectangle, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    ways = [[-1.0, 0.2, 0.1], [-1.0, -0.3, 0.4], [1.0, -0.5, -0.4]]
+    empty, divided = (
+        traced(metal(mesh), ways, depth=1, edges=2)
+        for mesh in (body, concatenate_meshes([body, partition]))
+    )
+    assert float(empty["edges 1"].abs().max()) > 1e-3
+    for name, part in empty.items():
+        assert torch.allclose(divided[name], part, rtol=1e-4, atol=1e-6), name
+
+
+def test_the_widest_region_between_faces_is_the_exterior_of_an_edge():
+    angles = torch.deg2rad(float64([0.0, 40.0, 100.0]))
+    fans = torch.stack([angles.cos(), angles.sin(), torch.zeros(3)], 1).double()
+    axis = float64([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    corners = torch.cat([axis.expand(3, 2, 3), fans[:, None]], 1)
+    wedges = find_wedges(corners, axis[None], torch.tensor([[0, 1, 2]]))
+    assert wedges.opening.tolist() == pytest.approx([260 / 180])
+    place = [wedges.faces[0].tolist().index(n) for n in (0, 2)]
+    assert torch.allclose(wedges.face_tangents[0, place], fans[[0, 2]])
+    outward = float64([0.0, -1.0, 0.0])  # of the first face, away from the others
+    assert torch.allclose(wedges.normals[0, place[0]], outward, atol=1e-12)
 
 
 def edges_of(mesh: Mesh) -> tuple[int, int]:

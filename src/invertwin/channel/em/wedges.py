@@ -14,7 +14,9 @@ a half plane's strip of that length has, which is exact for N = 2 and removes th
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -25,7 +27,7 @@ from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot, phasor
 from invertwin.channel.em.transition_functions import EXP_J_PI_4, transition
-from invertwin.channel.rows import Rows, bound_groups, concatenate_rows
+from invertwin.channel.rows import Rows, bound_groups, concatenate_rows, strip_rows
 from invertwin.checks import strip_derivatives
 from invertwin.scene.mesh_topology import label_components
 
@@ -34,8 +36,9 @@ MIN_EDGE_ANGLE = math.radians(10.0)
 _MERGE_TOLERANCE = 1e-6  # rad, and fraction of the scene's size: equal lines and planes
 _GENERIC_DIRECTION = torch.tensor([0.8123, 0.4571, 0.3623], dtype=torch.float64)
 _SWAPPED_FACES = torch.tensor([1, 0])
-_SAME_SIDE = 1e-3  # rad between half planes at an edge that count as one
 _MIN_CREASE_ANGLE = 0.35  # rad between adjacent normals; less is a curved surface
+# Corners of a detour round an edge, as shares of its exterior.
+_DETOUR_ANGLES = (0.1, 0.26, 0.42, 0.58, 0.74, 0.9)
 _POLE_WIDTH = 1e-5
 _MIN_PHASE = math.pi  # along a strip: over narrower faces currents go on round the next edge
 _TRANSITION_AT_ZERO = math.sqrt(math.pi) * EXP_J_PI_4
@@ -73,8 +76,9 @@ def find_wedges(
 ) -> Wedges:
     """Find the sharp edges of a mesh: open edges and creases of more than 20°.
 
-    A crease of a sheet is two wedges, one on each side. Smooth tessellation and concave creases
-    (exterior angles below π, covered by physical optics with multiple bounces) are left out.
+    Where several triangles meet, the exterior is the widest region between two of them; doubled
+    triangles count as one. Smooth tessellation and concave creases (exterior angles below π,
+    covered by physical optics with multiple bounces) are left out.
 
     Args:
         corners: corners of the triangles [m].
@@ -82,11 +86,8 @@ def find_wedges(
         edge_faces: triangles at each edge (−1: none).
     """
     found: list[Wedges] = []
-    with _DisableFuncTorch():  # discrete, as below
-        fixed = strip_derivatives(corners), strip_derivatives(endpoints)
-        edge_faces = _drop_doubled_sides(*fixed, edge_faces)
     number = (edge_faces >= 0).sum(1)
-    for count in (1, 2):
+    for count in range(1, edge_faces.shape[1] + 1):
         edge = torch.nonzero(number == count)[:, 0]
         faces = edge_faces[edge].sort(1, descending=True).values[:, :count]
         axis = normalize(endpoints[edge, 1] - endpoints[edge, 0], dim=1)
@@ -96,35 +97,47 @@ def find_wedges(
         # Triangles without area have no face tangent.
         valid = (normal.detach().norm(dim=2) > 0.5).all(1)
         edge, faces, t, normal = edge[valid], faces[valid], t[valid], normal[valid]
-        ends = endpoints[edge, 0], endpoints[edge, 1]
-        if count == 1:
-            sides = t.expand(-1, 2, 3), torch.cat([normal, -normal], 1)
-            opening = torch.full((len(edge),), 2.0, dtype=torch.float64)
-            found.append(Wedges(*ends, *sides, opening, faces.expand(-1, 2)))
-            continue
-        # Angle from the first face to the second about the edge, through the first one's normal.
-        angle_in = torch.atan2(dot(normal[:, 0], t[:, 1]), dot(t[:, 0], t[:, 1]))
-        angle_in = angle_in % (2 * math.pi)
-        for sign in (1.0, -1.0):
-            angle = angle_in if sign > 0 else 2 * math.pi - angle_in
-            keep = angle.detach() > math.pi + _MIN_CREASE_ANGLE
-            # Normals that point into this region: along the first turn, against the second.
-            normals = torch.stack([sign * normal[:, 0], -sign * normal[:, 1]], 1)
-            found.append(Wedges(*ends, t, normals, angle / math.pi, faces).select(keep))
+        # Angles of the faces about the edge; the widest region between two of them is the exterior.
+        angle = torch.atan2(dot(normal[:, :1], t), dot(t[:, :1], t)) % (2 * math.pi)
+        order = angle.detach().argsort(1)
+        angle = angle.gather(1, order)
+        gap = torch.cat([angle, angle[:, :1] + 2 * math.pi], 1).diff(dim=1)
+        widest = gap.detach().argmax(1, keepdim=True)
+        gap = gap.gather(1, widest)[:, 0]
+        pair = order.gather(1, torch.cat([widest, (widest + 1) % count], 1))
+        t, normal, faces = (x[torch.arange(len(x))[:, None], pair] for x in (t, normal, faces))
+        normal = torch.stack([normal[:, 0], -normal[:, 1]], 1)
+        start, end = endpoints[edge].unbind(1)
+        wedges = Wedges(start, end, t, normal, gap / math.pi, faces)
+        found.append(wedges.select(gap.detach() > math.pi + _MIN_CREASE_ANGLE))
     return concatenate_rows(found)
 
 
-def _drop_doubled_sides(corners: Tensor, endpoints: Tensor, edge_faces: Tensor) -> Tensor:
-    """Keep one of the triangles in one half plane at an edge, as those of a doubled face."""
-    edge_faces, several = edge_faces.clone(), torch.nonzero((edge_faces >= 0).sum(1) > 2)[:, 0]
-    faces, (start, end) = edge_faces[several], endpoints[several].unbind(1)
-    axis = normalize(end - start, dim=1)[:, None]
-    into = corners[faces].mean(2) - start[:, None]
-    into = normalize(into - dot(into, axis)[..., None] * axis, dim=2)
-    alike = (into[:, :, None] - into[:, None]).norm(dim=3) < _SAME_SIDE
-    alike &= (faces >= 0)[:, :, None] & (faces >= 0)[:, None]
-    edge_faces[several] = torch.where(alike.tril(-1).any(2), -1, faces)
-    return edge_faces
+def has_open_exterior(
+    wedges: Wedges,
+    points: Float64[Tensor, "row 3"],
+    offset: float,
+    is_clear: Callable[[Tensor, Tensor], Bool[Tensor, " row"]],
+) -> Bool[Tensor, " row"]:
+    """Test if no surface fills part of the exterior of edges, by a detour round points on them.
+
+    Plates that meet in a seam, a box on the floor, and partitions in a body have edges that do not
+    diffract.
+
+    Args:
+        wedges: sharp edges, one row each.
+        points: points on the edges [m].
+        offset: distance of the detour from the edge [m].
+        is_clear: test of straight lines between pairs of points.
+    """
+    with _DisableFuncTorch():  # discrete
+        wedges, points = strip_rows(wedges), strip_derivatives(points)
+        angle = wedges.opening[:, None] * wedges.opening.new_tensor(_DETOUR_ANGLES) * math.pi
+        stops = [
+            points + offset * (c * wedges.face_tangents[:, 0] + s * wedges.normals[:, 0])
+            for c, s in zip(angle.cos().T[..., None], angle.sin().T[..., None], strict=True)
+        ]
+        return torch.stack([is_clear(*pair) for pair in pairwise(stops)]).all(0)
 
 
 def select_body_edges(wedges: Wedges, min_length: float) -> Bool[Tensor, " row"]:

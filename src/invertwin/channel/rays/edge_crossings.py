@@ -5,11 +5,13 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
+from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import cross, dot, triangle_normals
 from invertwin.channel.em.wedges import Wedges, edge_axis
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
+from invertwin.channel.rows import strip_rows
 
 _MIN_SINE = 1e-3  # of the angle between an edge and a face that it passes through
 
@@ -19,29 +21,31 @@ def find_crossings(rays: Occluders, wedges: Wedges, offset: float) -> Int64[Tens
 
     Args:
         rays: occluders.
-        wedges: sharp edges, detached.
+        wedges: sharp edges.
         offset: distance from an edge at which rays run along it, and least length of a piece [m].
     """
-    outward = offset * normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
-    begin, end, edge = wedges.start + outward, wedges.end + outward, torch.arange(len(outward))
-    found = [torch.zeros(0, 2, dtype=torch.int64)]
-    while len(edge):
-        face, share = find_next_surface(rays, begin, end)
-        found.append(torch.stack([edge, face], 1)[face >= 0])
-        step = share[:, None] * (end - begin) + offset * normalize(end - begin, dim=1)
-        left = (face >= 0) & (step.norm(dim=1) < (end - begin).norm(dim=1))
-        begin, end, edge = (begin + step)[left], end[left], edge[left]
-    pairs = torch.cat(found)
-    pairs = pairs[pairs[:, 0].argsort(stable=True)]  # hits follow each other along an edge
-    corners = rays.local_vertices.double()[rays.topology.faces] + rays.origin
-    # Rays beside an edge also meet faces in whose plane it lies.
-    normal = triangle_normals(corners[pairs[:, 1]])
-    pairs = pairs[dot(edge_axis(wedges)[pairs[:, 0]], normal).abs() > _MIN_SINE]
-    length = (wedges.end - wedges.start).norm(dim=1)[pairs[:, 0]]
-    along = length * _crossing_shares(wedges, pairs, corners)
-    inside = (along > offset) & (along < length - offset)
-    inside[1:] &= (along.diff() > offset) | (pairs[:, 0].diff() > 0)
-    return pairs[inside]
+    with _DisableFuncTorch():  # discrete
+        wedges = strip_rows(wedges)
+        outward = offset * normalize((wedges.normals - wedges.face_tangents).sum(1), dim=1)
+        begin, end, edge = wedges.start + outward, wedges.end + outward, torch.arange(len(outward))
+        found = [torch.zeros(0, 2, dtype=torch.int64)]
+        while len(edge):
+            face, share = find_next_surface(rays, begin, end)
+            found.append(torch.stack([edge, face], 1)[face >= 0])
+            step = share[:, None] * (end - begin) + offset * normalize(end - begin, dim=1)
+            left = (face >= 0) & (step.norm(dim=1) < (end - begin).norm(dim=1))
+            begin, end, edge = (begin + step)[left], end[left], edge[left]
+        pairs = torch.cat(found)
+        pairs = pairs[pairs[:, 0].argsort(stable=True)]  # hits follow each other along an edge
+        corners = rays.local_vertices.double()[rays.topology.faces] + rays.origin
+        # Rays beside an edge also meet faces in whose plane it lies.
+        normal = triangle_normals(corners[pairs[:, 1]])
+        pairs = pairs[dot(edge_axis(wedges)[pairs[:, 0]], normal).abs() > _MIN_SINE]
+        length = (wedges.end - wedges.start).norm(dim=1)[pairs[:, 0]]
+        along = length * _crossing_shares(wedges, pairs, corners)
+        inside = (along > offset) & (along < length - offset)
+        inside[1:] &= (along.diff() > offset) | (pairs[:, 0].diff() > 0)
+        return pairs[inside]
 
 
 def split_at_crossings(

@@ -14,12 +14,11 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Complex128, Float64, Int64
 from torch import Tensor
-from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.beams import beam_tracing
@@ -40,7 +39,7 @@ from invertwin.channel.rcs.moments.solver import Refusal, warn_not_solved
 from invertwin.channel.rcs.plate_diffraction import find_plates, trace_multiple_diffractions
 from invertwin.channel.rcs.shooting_bouncing_rays import find_illuminated_triangles, trace_tubes
 from invertwin.channel.rcs.surface_paths import face_path_lengths
-from invertwin.checks import is_differentiated, strip_derivatives
+from invertwin.checks import is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.runtime.concurrency import torch_threads
@@ -129,15 +128,20 @@ class _FarFieldTarget:
         """Pieces of sharp edges, their middles, and the widths of both faces across each [m]."""
         # Edges end where they pass through surfaces.
         edges, facets = self.sharp_edges, self.facets
-        with _DisableFuncTorch():  # discrete
-            fixed = wedge_geometry.Wedges(*map(strip_derivatives, vars(edges).values()))
-            met = edge_crossings.find_crossings(self.occluders, fixed, _EDGE_OFFSET * facets.size)
+        met = edge_crossings.find_crossings(self.occluders, edges, _EDGE_OFFSET * facets.size)
         edges = edge_crossings.split_at_crossings(edges, met, facets.corners)
         pieces = _split_edges(edges, self.wavelength / _SEGMENTS_PER_WAVELENGTH)
-        middle, bodies = (pieces.start + pieces.end) / 2, (self.facets, self.occluders)
+        pieces = self.select_open_edges(pieces)
+        middle, bodies = (pieces.start + pieces.end) / 2, (facets, self.occluders)
         sides = zip(pieces.faces.unbind(1), pieces.face_tangents.unbind(1), strict=True)
         widths = [face_path_lengths(*bodies, face, middle, inward) for face, inward in sides]
         return pieces, middle, torch.stack(widths, 1)
+
+    def select_open_edges(self, edges: wedge_geometry.Wedges) -> wedge_geometry.Wedges:
+        """Select edges with no other surface in their exterior, at their middle."""
+        middle, rays = (edges.start + edges.end) / 2, partial(is_visible, self.occluders)
+        offset = _EDGE_OFFSET * self.facets.size
+        return edges.select(wedge_geometry.has_open_exterior(edges, middle, offset, rays))
 
     @property
     def is_smooth_metal(self) -> bool:
@@ -356,7 +360,8 @@ class _FarFieldTracer:
         """Contributions of sharp edges of conductors (PTD)."""
         target = self.target
         found = {"edges 1": self._fringe_amplitudes()}
-        plates = find_plates(target.sharp_edges) if max_diffractions > 1 else []
+        several = max_diffractions > 1
+        plates = find_plates(target.select_open_edges(target.sharp_edges)) if several else []
         totals = [list(self._zero_amplitudes()) for _ in range(2, max_diffractions + 1)]
         every = torch.arange(len(self.transmitters))
         for f, k in enumerate(target.wave_numbers if plates else ()):

@@ -5,20 +5,19 @@ Source: derivations §9.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
-from torch._C import _DisableFuncTorch
 from torch.nn.functional import normalize
 
 from invertwin.channel.em import wedges as sharp_edges
 from invertwin.channel.em.plane_waves import dot
-from invertwin.channel.em.wedges import Wedges, edge_axis, find_wedges
+from invertwin.channel.em.wedges import Wedges, edge_axis, has_open_exterior
 from invertwin.channel.rays.edge_crossings import find_crossings, split_at_crossings
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rows import strip_rows
 from invertwin.channel.specular.edge_path_geometry import PathEdge
 from invertwin.channel.specular.image_method import CandidateSurfaces, is_unobstructed
 from invertwin.checks import strip_derivatives
@@ -30,8 +29,6 @@ TriangleCoefficients = Callable[[Int64[Tensor, " n"], Float64[Tensor, " n"]], Fi
 _OFFSET_MARGINS = 10.0  # margins of the ray scene: distance of rays' ends from an edge
 _GRAZING_TOLERANCE = 1e-9  # rad
 _EDGE_PIECES = 16  # pieces of an edge, each open or covered as a whole
-# Corners of a detour round an edge, as shares of its exterior.
-_DETOUR_ANGLES = (0.1, 0.26, 0.42, 0.58, 0.74, 0.9)
 
 
 @dataclass(frozen=True)
@@ -53,22 +50,18 @@ class WedgeScene:
     @cached_property
     def wedges(self) -> Wedges:
         """Sharp edges: collinear ones merged, and split where they pass through surfaces."""
-        return self._split_edges(self.vertices)
+        corners = self.vertices[self.topology.faces]
+        ends = self.vertices[self.topology.edges]
+        wedges = sharp_edges.merge_collinear_wedges(
+            sharp_edges.find_wedges(corners, ends, self.topology.edge_faces)
+        )
+        crossings = find_crossings(self.surfaces, wedges, self.ray_offset)
+        return split_at_crossings(wedges, crossings, corners)
 
     @cached_property
     def detached_wedges(self) -> Wedges:
         """Detached sharp edges."""
-        return self._split_edges(strip_derivatives(self.vertices))
-
-    def _split_edges(self, vertices: Float64[Tensor, "v 3"]) -> Wedges:
-        wedges = _sharp_edges(vertices, self.topology)
-        return split_at_crossings(wedges, self._crossings, vertices[self.topology.faces])
-
-    @cached_property
-    def _crossings(self) -> Int64[Tensor, "n 2"]:
-        with _DisableFuncTorch():  # discrete
-            wedges = _sharp_edges(strip_derivatives(self.vertices), self.topology)
-            return find_crossings(self.surfaces, wedges, self.ray_offset)
+        return strip_rows(self.wedges)
 
     @property
     def ray_offset(self) -> float:
@@ -117,8 +110,6 @@ class WedgeScene:
     def is_diffracting(self, row: Tensor, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
         """Test if an edge diffracts at a point: no other surface fills part of its exterior.
 
-        Plates that meet in a seam, and a box on the floor, have edges that do not diffract.
-
         Args:
             row: numbers of wedges.
             points: points on the lines of the edges [m].
@@ -132,21 +123,10 @@ class WedgeScene:
         wedges = self.detached_wedges
         share = (torch.arange(_EDGE_PIECES, dtype=torch.float64) + 0.5) / _EDGE_PIECES
         points = wedges.start[:, None] + share[:, None] * (wedges.end - wedges.start)[:, None]
-        into, normal = wedges.face_tangents[:, 0], wedges.normals[:, 0]
-        stops: list[Tensor] = []
-        for part in _DETOUR_ANGLES:
-            angle = (part * torch.pi * wedges.opening)[:, None]
-            offset = self.ray_offset * (angle.cos() * into + angle.sin() * normal)
-            stops.append((points + offset[:, None]).reshape(-1, 3))
-        clear = torch.ones(len(stops[0]), dtype=torch.bool)
-        for start, end in pairwise(stops):
-            clear &= is_unobstructed(self.surfaces, start, end)
+        rows = wedges.select(torch.arange(len(points)).repeat_interleave(_EDGE_PIECES))
+        is_clear = partial(is_unobstructed, self.surfaces)
+        clear = has_open_exterior(rows, points.reshape(-1, 3), self.ray_offset, is_clear)
         return clear.reshape(-1, _EDGE_PIECES)
-
-
-def _sharp_edges(vertices: Tensor, topology: Topology) -> Wedges:
-    wedges = find_wedges(vertices[topology.faces], vertices[topology.edges], topology.edge_faces)
-    return sharp_edges.merge_collinear_wedges(wedges)
 
 
 def is_exterior(wedges: Wedges, points: Float64[Tensor, "row 3"]) -> Bool[Tensor, " row"]:
