@@ -351,6 +351,24 @@ def test_partitions_in_a_body_do_not_diffract(corner):
         assert torch.allclose(divided[name], part, rtol=1e-4, atol=1e-6), name
 
 
+def test_waves_pass_a_slit_far_narrower_than_a_wavelength_as_if_it_were_closed():
+    slit = 1e-3 * WAVELENGTH
+    half = box((0.04, 0.03 - slit / 2, 0.05))
+    offset = float64([0.0, 0.015 + slit / 4, 0.0])
+    halves = {
+        name: Object(Mesh(half.vertices + side * offset, half.faces), METAL)
+        for name, side in (("left", -1), ("right", 1))
+    }
+    ways = [[-1.0, 0.2, 0.1], [-1.0, -0.3, 0.4], [1.0, -0.5, -0.4]]
+    whole, divided = (
+        traced(scene, ways, depth=1, edges=2)
+        for scene in (metal(box((0.04, 0.06, 0.05))), Scene(halves))
+    )
+    difference = divided["edges 1"] - whole["edges 1"]
+    # Strips across the faces end at the slit; with four edges along it the difference is 0.6.
+    assert float(difference.abs().max()) < 0.15 * float(whole["edges 1"].abs().max())
+
+
 def test_the_widest_region_between_faces_is_the_exterior_of_an_edge():
     angles = torch.deg2rad(float64([0.0, 40.0, 100.0]))
     fans = torch.stack([angles.cos(), angles.sin(), torch.zeros(3)], 1).double()

@@ -52,6 +52,7 @@ _MIN_TURN_ANGLE = 1e-6  # rad between adjacent normals of a curved surface
 _SEGMENTS_PER_WAVELENGTH = 2.0  # pieces of an edge, each visible or not
 _MIN_EDGE_RUN = 2.0  # wavelengths: least length of an edge that ends in a smooth surface
 _EDGE_OFFSET = 1e-5  # of the scene's size: distance of rays' ends from an edge
+_MIN_GAP = 5e-3  # wavelengths: waves pass narrower gaps between surfaces as if they were closed
 _FAR = 10.0  # of the scene's size: distance from where surfaces are seen
 _ROWS_AT_ONCE = 1 << 18
 _MAX_POWER_GAIN = 1.1  # of an order over the one before: power at a focus is approximate
@@ -140,7 +141,7 @@ class _FarFieldTarget:
     def select_open_edges(self, edges: wedge_geometry.Wedges) -> wedge_geometry.Wedges:
         """Select edges with no other surface in their exterior, at their middle."""
         middle, rays = (edges.start + edges.end) / 2, partial(is_visible, self.occluders)
-        offset = _EDGE_OFFSET * self.facets.size
+        offset = max(_EDGE_OFFSET * self.facets.size, _MIN_GAP * self.wavelength)
         return edges.select(wedge_geometry.has_open_exterior(edges, middle, offset, rays))
 
     @property
