@@ -38,6 +38,12 @@ def test_a_plan_states_error_bars_and_ranks_positions(run_file, monkeypatch, cap
     said = capsys.readouterr().out
     assert "Expected error bars" in said
     assert "Positions to add" in said
+    ends = f"times {first['share']:.2f}; 2 parameters, 0 directions not observed"
+    assert (
+        metrics["answer"]
+        == f"Best position to add (0.00, -0.20, 0.10) m: standard deviations {ends}"
+    )
+    assert metrics["answer"] in said
 
 
 def test_a_plan_of_measured_data_is_refused(run_file, monkeypatch, capsys):

@@ -151,7 +151,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
         from invertwin.cli.commands.plan import run_plan
 
         with prefix_file_errors(file):
-            return run_plan(runs[file.stem], folder, console), ""
+            return run_plan(runs[file.stem], folder, console)
 
     run_in_folder(options, Path("out", file.stem), work, runs)
 

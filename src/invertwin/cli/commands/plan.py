@@ -11,7 +11,7 @@ from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import Problem, make_observations, make_unknowns, stage_runs
 from invertwin.cli.fits.radar_models import with_new_recording
 from invertwin.cli.fits.scores import error_bar_table
-from invertwin.cli.report import ReportTable, load_texts, write_report
+from invertwin.cli.report import ReportTable, format_place, load_texts, write_report
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
 from invertwin.cli.terminal import limit_rate, show_progress
@@ -23,8 +23,8 @@ from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 
 
-def run_plan(run: RunFile, folder: RunFolder, console: Console) -> list[ReportTable]:
-    """State the error bars of a run that has not been recorded; return the tables to print.
+def run_plan(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[ReportTable], str]:
+    """State the error bars of a run that has not been recorded; return tables and a sentence.
 
     Simulated fits that an interrupted run has finished are not done again.
 
@@ -56,17 +56,17 @@ def run_plan(run: RunFile, folder: RunFolder, console: Console) -> list[ReportTa
         for one in added
     ]
     metrics |= _compare_with_fits(replace(own, run=run), found.deviations, folder, console)
-    metrics["wall_seconds"] = time.perf_counter() - begin
     parts = [replace(error_bar_table(metrics), title="Expected error bars")]
+    answer = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed"
     if added:
-        ranked = enumerate(metrics["candidates"], 1)
-        rows = [[str(rank), row["position"], row["share"]] for rank, row in ranked]
-        heads = ("rank", "position [m]", "deviations, times")
-        note = load_texts("notes")["candidates"]
-        parts.append(ReportTable("Positions to add", heads, rows, note))
-    status = f"{len(found.names)} parameters, {len(found.unobserved)} directions not observed."
-    title = run.title or "Plan"
-    return write_report(folder, metrics, title, status, parts, again="plan", note=run.note)
+        rows = [[str(k), c["position"], c["share"]] for k, c in enumerate(metrics["candidates"], 1)]
+        heads, note = ("rank", "position [m]", "deviations, times"), "candidates"
+        parts.append(ReportTable("Positions to add", heads, rows, load_texts("notes")[note]))
+        best = f"Best position to add ({format_place(rows[0][1])}) m: standard deviations times"
+        answer = f"{best} {rows[0][2]:.2f}; {answer}"
+    metrics |= {"answer": answer, "wall_seconds": time.perf_counter() - begin}
+    how: dict[str, Any] = {"again": "plan", "note": run.note}
+    return write_report(folder, metrics, run.title or "Plan", f"{answer}.", parts, **how), answer
 
 
 def _prepare_fit_at_truth(problem: Problem) -> Any:
