@@ -62,8 +62,8 @@ def run_plan(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Re
         rows = [[str(k), c["position"], c["share"]] for k, c in enumerate(metrics["candidates"], 1)]
         heads, note = ("rank", "position [m]", "deviations, times"), "candidates"
         parts.append(ReportTable("Positions to add", heads, rows, load_texts("notes")[note]))
-        best = f"Best position to add ({format_place(places[added[0].frame - first].tolist())}) m: standard deviations times"
-        answer = f"{best} {added[0].deviation_ratio:.2f}; {answer}"
+        best, share = format_place(places[added[0].frame - first].tolist()), rows[0][2]
+        answer = f"Best position to add ({best}) m: standard deviations times {share:.2f}; {answer}"
     metrics |= {"answer": answer, "wall_seconds": time.perf_counter() - begin}
     how: dict[str, Any] = {"again": "plan", "note": run.note}
     return write_report(folder, metrics, run.title or "Plan", f"{answer}.", parts, **how), answer
