@@ -1,5 +1,6 @@
 """Scenes of simple shapes: their likelihood for recorded maps, and their joint fit."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -131,6 +132,17 @@ class ShapeLikelihood:
     def total_gain(self, shapes: Shapes) -> float:
         """Sum of ``log_likelihood_gains`` over the frames."""
         return float(self.log_likelihood_gains(shapes).sum())
+
+    def evidence(self, shapes: Shapes) -> float:
+        """Compute the log-likelihood minus half the log number of draws per free parameter (BIC).
+
+        Source: Schwarz, "Estimating the dimension of a model", 1978.
+
+        Args:
+            shapes: shape parameters.
+        """
+        count = sum(7 if one.is_rectangular else 5 for one in shapes)
+        return self.total_gain(shapes) - 0.5 * count * math.log(self.independent_draws)
 
     @cached_property
     def _background_loss(self) -> Tensor:

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from torch import Tensor
 
 from invertwin.discovery.assembly import ShapeLikelihood
+from invertwin.discovery.imaging.likelihood import find_grating_lobes
 from invertwin.discovery.search import propose_kinds, rotate_headed_shapes
 from invertwin.discovery.shapes.primitives import ShapeParameters, Shapes, shape_center
 from invertwin.inversion import Reconstruction, speckle_weight
@@ -60,15 +62,48 @@ def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
         gains_without: log-likelihood gains of all frames without the change.
     """
     gain = gains_with - gains_without
-    total = float(gain.sum())
-    if len(gain) < 4:
-        return 1 - min(1.0, math.exp(-max(total, 0.0)))
     spread = float(gain.std()) * math.sqrt(len(gain))
-    return float(torch.special.ndtr(torch.tensor(total / max(spread, 1e-9)).double()))
+    return float(torch.special.ndtr(gain.sum() / max(spread, 1e-9)))
+
+
+def _exchange(shapes: Shapes, number: int, new: ShapeParameters) -> list[ShapeParameters]:
+    return [*shapes[:number], new, *shapes[number + 1 :]]
+
+
+def _odds_against(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> float:
+    right = min(max(preference(likelihood, shapes, rivals), 1e-6), 1 - 1e-6)
+    return (1 - right) / right
+
+
+def preference(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> float:
+    """Compute the probability that one set of shapes, rather than another, made the maps.
+
+    The difference of their likelihoods is compared with its scatter: between frames or, where these
+    are few, between independent draws. Two shapes that are both slightly wrong differ by chance.
+
+    Source: Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses",
+    Econometrica 57, 1989.
+
+    Args:
+        likelihood: likelihood of the maps.
+        shapes: shapes.
+        rivals: other shapes.
+    """
+    if likelihood.radar.frame_count >= _MIN_FRAMES:
+        return acceptance_probability(*map(likelihood.log_likelihood_gains, (shapes, rivals)))
+    new, old = (
+        likelihood.loss.bin_losses(likelihood.predict(row), likelihood.power).double()
+        for row in (shapes, rivals)
+    )
+    gain = old - new
+    spread = float(gain.square().sum() * likelihood.bins_per_draw) ** 0.5
+    return float(torch.special.ndtr(gain.sum() / max(spread, 1e-9)))
 
 
 def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list[float]:
     """Compute the existence probability of every shape.
+
+    In few frames, a shape must explain more than its free parameters do by chance.
 
     Args:
         likelihood: likelihood of the maps.
@@ -76,6 +111,10 @@ def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list
     """
     together = likelihood.log_likelihood_gains(shapes)
     without = [[*shapes[:k], *shapes[k + 1 :]] for k in range(len(shapes))]
+    if len(together) < _MIN_FRAMES:
+        evidence = likelihood.evidence(shapes)
+        odds = [evidence - likelihood.evidence(rest) for rest in without]
+        return torch.tensor(odds, dtype=torch.float64).sigmoid().tolist()
     return [acceptance_probability(together, likelihood.log_likelihood_gains(r)) for r in without]
 
 
@@ -105,7 +144,6 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
         likelihood: likelihood of the maps.
         shapes: fitted shapes.
     """
-    together = likelihood.log_likelihood_gains(shapes)
     found = [[ShapeHypothesis(shape, 1.0)] for shape in shapes]
     for changed in (*propose_kinds(likelihood, shapes), rotate_headed_shapes(shapes, math.pi)):
         if not changed:
@@ -115,18 +153,58 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
             if start is old:
                 continue
             # The first steps of a short fit may lower the likelihood.
-            options = [
-                (likelihood.log_likelihood_gains([*shapes[:number], r, *shapes[number + 1 :]]), r)
-                for r in (start, new)
-            ]
-            swapped, other = max(options, key=lambda option: float(option[0].sum()))
-            right = min(max(acceptance_probability(together, swapped), 1e-6), 1 - 1e-6)
-            found[number].append(ShapeHypothesis(other, (1 - right) / right))
+            options = [_exchange(shapes, number, one) for one in (start, new)]
+            swapped = max(options, key=likelihood.total_gain)
+            odds = _odds_against(likelihood, shapes, swapped)
+            found[number].append(ShapeHypothesis(swapped[number], odds))
+    lobes = find_grating_lobes(likelihood.radar, likelihood.model.grid)
+    for (number, row), offset in product(list(enumerate(map(tuple, found))), lobes):
+        if (turned := rotate_to_lobe(likelihood, shapes[number], offset)) is None:
+            continue
+        # The array distinguishes kinds there as here.
+        odds = _odds_against(likelihood, shapes, _exchange(shapes, number, turned))
+        for other in row:
+            moved = rotate_to_lobe(likelihood, other.shape, offset) or turned
+            found[number].append(ShapeHypothesis(moved, odds * other.probability))
     totals = [sum(other.probability for other in row) for row in found]
     return [
         [replace(other, probability=other.probability / total) for other in row]
         for row, total in zip(found, totals, strict=True)
     ]
+
+
+def rotate_to_lobe(
+    likelihood: ShapeLikelihood, shape: ShapeParameters, offset: float
+) -> ShapeParameters | None:
+    """Rotate a shape about the radar into a grating lobe of its array.
+
+    It keeps its range, its aspect and its echo, as the middle position sees it.
+
+    Args:
+        likelihood: likelihood of the maps.
+        shape: present shape.
+        offset: offset of u, see ``find_grating_lobes``.
+
+    Returns:
+        None out of the radar's view, or for a prism, whose outline does not turn.
+    """
+    link, middle = likelihood.radar.link(), likelihood.radar.frame_count // 2
+    place, axes = likelihood.radar.positions[middle].detach(), link.rotations[middle].detach()
+    way = shape_center(shape, likelihood.level) - place
+    old = way / way.norm() @ axes
+    new = old + old.new_tensor([0.0, offset, 0.0])
+    new[0] = (1 - new[1:].square().sum()).clamp_min(0.0).sqrt().copysign(old[0])
+    old_gain, gain = (
+        float(link.tx_pattern.gain(one[None]) * link.rx_pattern.gain(one[None]))
+        for one in (old, new)
+    )
+    if new[0] == 0 or gain == 0 or shape.kind == "prism":
+        return None
+    away = way.norm() * axes @ new
+    turns = [math.atan2(float(one[1]), float(one[0])) for one in (way, away)]
+    x, y = (place + away)[:2].tolist()
+    yaw, brightness = shape.yaw + turns[1] - turns[0], shape.brightness * old_gain / gain
+    return replace(shape, position=(x, y), yaw=yaw, brightness=brightness)
 
 
 def kind_probabilities(hypotheses: Hypotheses) -> dict[str, float]:
@@ -171,3 +249,4 @@ def widen_deviations(
 
 
 _SHORT_FIT_STEPS = 20  # steps
+_MIN_FRAMES = 4  # whose scatter is an error bar

@@ -1,7 +1,7 @@
 """Automatic reconstruction of a recording, without an initial guess."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +38,7 @@ _DEFAULT_RADAR_HEIGHT = 0.6  # default height of radars above the ground [m]
 _FEW_CHANNELS = 4  # along an axis of the array, whose maps have no taper
 _FINAL_FIT_STEPS = 50  # steps of the final fit
 _MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
+_MIN_STATED_PROBABILITY = 0.05  # of another place of an object
 _HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
 _Corner = Sequence[float] | None  # x and y [m]; None = all that is seen
 
@@ -246,7 +247,24 @@ def _search_shapes(
         shapes, found = one.fit(likelier, _FINAL_FIT_STEPS)
         among = certainty.find_hypotheses(one, shapes)
     errors = certainty.standard_deviations(one, found)
+    notes += tuple(_state_other_places(among))
     return shapes, _describe_objects(one, errors, shapes, among), notes
+
+
+def _state_other_places(among: Sequence[certainty.Hypotheses]) -> Iterator[str]:
+    """State where else an object may be if its hypotheses lie apart from its likeliest place."""
+    for number, (first, *others) in enumerate(among, 1):
+        size = max(first.shape.length, first.shape.width)
+        far = [
+            one
+            for one in others
+            if math.dist(one.shape.position, first.shape.position)
+            > max(size, one.shape.length, one.shape.width)
+        ]
+        share = sum(one.probability for one in far)
+        if share > _MIN_STATED_PROBABILITY:
+            place = max(far, key=lambda one: one.probability).shape.position
+            yield _NOTES["other_place"].format(number, share, *place)
 
 
 def _describe_objects(

@@ -52,16 +52,13 @@ class ImageGrid:
 class ShapeSearch:
     """Search for the shapes that fit maps.
 
-    Evidence is the log-likelihood of the fitted frames minus half the logarithm of the number of
-    draws per free parameter (BIC); a change must not lower the likelihood of held-out frames
-    either.
+    A change must raise the evidence of the fitted frames, and not lower the likelihood of held-out
+    frames.
 
     Attributes:
         fitted_frames: likelihood of the fitted frames.
         held_out_frames: likelihood of the held-out frames; None = too few frames.
         image_grid: points of the image.
-
-    Source of the penalty: Schwarz, "Estimating the dimension of a model", 1978.
     """
 
     fitted_frames: ShapeLikelihood
@@ -74,8 +71,7 @@ class ShapeSearch:
         Args:
             shapes: candidate shapes.
         """
-        likelihood, count = self.fitted_frames, sum(7 if s.is_rectangular else 5 for s in shapes)
-        return likelihood.total_gain(shapes) - 0.5 * count * math.log(likelihood.independent_draws)
+        return self.fitted_frames.evidence(shapes)
 
     def is_better(self, new: Shapes, old: Shapes) -> bool:
         """Return whether new shapes are preferred to old ones.

@@ -127,6 +127,23 @@ def direction_axes(radar: Radar, grid: Grid) -> list[MapAxis]:
     ]
 
 
+def find_grating_lobes(radar: Radar, grid: Grid) -> list[float]:
+    """Find the offsets of u at which the array responds as to the true direction, within 3 dB.
+
+    Args:
+        radar: radar with its array and its window.
+        grid: bins of the map.
+    """
+    axis = direction_axes(radar, grid)[0]
+    if axis.count == 1:
+        return []
+    lags = torch.arange(-2.0, 2.0, 1e-3, dtype=torch.float64)
+    power = axis.response(lags / axis.step)
+    top = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:]) & (power[1:-1] > 0.5)
+    found = lags[1:-1][top]
+    return found[found.abs() > 2e-3].tolist()
+
+
 @dataclass(frozen=True, eq=False)
 class HeavyTailedLoss:
     """Negative log-likelihood of maps with heavy-tailed speckle.

@@ -12,7 +12,13 @@ from invertwin.channel import Grid
 from invertwin.discovery.imaging.reflectivity import direction_cell
 from invertwin.discovery.outcome import DetectedObject
 from invertwin.inversion.initialisation.detections import label_groups
-from invertwin.radar import detect_points, noise_power, range_doppler, velocity_span
+from invertwin.radar import (
+    detect_points,
+    noise_power,
+    range_doppler,
+    velocity_axis,
+    velocity_span,
+)
 from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.backprojection import pairwise_distances
 
@@ -22,6 +28,7 @@ _TARGET_SIDELOBE_LEVEL = 3e-3  # relative to the strongest target: weaker ones m
 _NO_SIDELOBE_LEVEL = 0.5  # relative to the strongest: stronger peaks are no sidelobes
 _DIRECTION_ERROR_BEAMS = 0.3  # standard deviation of a direction in beamwidths
 _MIN_EXISTENCE_PROBABILITY = 0.1  # less probable moving targets are dropped
+_FALSE_ALARM = 0.01  # chance that noise alone shows a moving target in a frame
 _MAX_POINTS = 50  # strongest of one frame
 _MIN_COHERENCE = 0.2  # 0.4 at the measured peak of a corner, below 0.1 between echoes
 _MAX_STEPS = 100  # nodes of an image on either side of its middle
@@ -62,9 +69,12 @@ def detect_moving_targets(
         return []
     labels = label_groups(torch.stack([points.range, rates], dim=1)[rows] / scales, 1.0)
     flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
+    # With the mean, the noise of range rates near 0 is removed too.
+    noisy = flat[:, velocity_axis(radar, chirps).abs() > 0.75 * cell]
     # Noise reduction of beams over all channels relative to one channel.
-    noise = noise_power(flat.abs().square(), 1) / len(radar.virtual_positions)
-    draws, top = flat.numel(), float(points.power[rows].max())
+    noise = noise_power(noisy.abs().square(), 1) / len(radar.virtual_positions)
+    array, top = aperture(radar), float(points.power[rows].max())
+    array_axes = sum(len(places) > 1 for places in (array.y, array.z))
     found: list[tuple[float, DetectedObject]] = []
     for number in range(int(labels.max()) + 1):
         own = rows[labels == number]
@@ -83,9 +93,11 @@ def detect_moving_targets(
             "across": _DIRECTION_ERROR_BEAMS * across,
             "range_rate": max(spread[1], 0.3 * cell),
         }
-        sure = max(0.0, 1 - draws * math.exp(-min(power / noise, 700.0)))
-        sure *= min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top))
-        if sure > _MIN_EXISTENCE_PROBABILITY:
+        # Upcrossings of the level by noise, over directions between the elements' beams too.
+        level = min(power / noise, 700.0)
+        chance = flat.numel() * (math.pi * level / 3) ** (0.5 * array_axes) * math.exp(-level)
+        sure = (1 - chance) * min(1.0, power / (_TARGET_SIDELOBE_LEVEL * top))
+        if chance < _FALSE_ALARM and sure > _MIN_EXISTENCE_PROBABILITY:
             velocity = float(rates[best]) * aways[best]
             target = DetectedObject.point("mover", position, deviations, sure, velocity)
             found.append((power, target))
