@@ -1,6 +1,7 @@
 """Twins of recordings: what is there is found, and nothing where there is nothing."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -282,6 +283,30 @@ def test_a_region_that_nothing_sees_is_refused():
         twin(capture, low=(1.0, 1.0), high=(-1.0, 1.0))
     with pytest.raises(InputError, match="range_max"):
         twin(capture, range_max=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_receivers_a_wavelength_apart_leave_two_places(seed):
+    """The echo is found in one of two lobes; its error bars reach the other, which a note names."""
+    ramp = iw.FMCW(77e9, 1e9, 50e-6, 128)
+    row = linear_array(2, ramp.wavelength, pattern=Cosine(1.0))
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    radar = iw.Radar(linear_array(1, 1.0, pattern=Cosine(1.0)), row, ramp, still)
+    truth = 3 * math.cos(0.4), 3 * math.sin(0.4)
+    scene = iw.Scene({"ball": thing(sphere(0.1, 3), truth, 0.0)})
+    sampling, chirps = replace(CHAIN, points_per_m2=3000.0), Chirps(16, 60e-6)
+    beat = iw.simulate_chirps(scene, radar, chirps, seed=seed, sampling=sampling)
+    recording = ChirpCapture(add_noise(beat, snr_db=40.0, seed=seed), radar, chirps)
+    found = twin(recording, range_max=6.0, level=-0.6, rays=1000, seed=seed)
+    (one,) = found.objects
+    assert one.existence_probability > 0.95
+    assert 0.5 < one.deviations["y"] < 3.0
+    for axis, value in enumerate(truth):
+        assert abs(float(one.position[axis]) - value) < 2.5 * one.deviations["xy"[axis]]
+    (note,) = found.notes
+    assert note.startswith("object_1 may be elsewhere with probability ")
 
 
 @pytest.mark.slow

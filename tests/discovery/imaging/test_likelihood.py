@@ -10,6 +10,7 @@ from invertwin.discovery.imaging.likelihood import (
     HeavyTailedLoss,
     count_bins_per_draw,
     estimate_background,
+    find_grating_lobes,
     map_axes,
 )
 from invertwin.scene import AntennaArray, linear_array
@@ -77,3 +78,16 @@ def test_noise_has_as_many_draws_as_bins_over_the_shared_ones():
     assert power[0].numel() / count_bins_per_draw(map_axes(device, grid)) == pytest.approx(
         draws, rel=0.25
     )
+
+
+@pytest.mark.filterwarnings("ignore::invertwin.errors.PhysicsWarning")
+@pytest.mark.parametrize(
+    ("count", "wavelengths", "lobes"),
+    [(2, 0.5, []), (2, 1.0, [-1.0, 1.0]), (3, 0.75, [-4 / 3, 4 / 3]), (1, 1.0, [])],
+)
+def test_elements_apart_have_grating_lobes(count, wavelengths, lobes):
+    """u + λ/d gives all elements the phases of u."""
+    place = torch.zeros(1, 3, dtype=torch.float64)
+    row = linear_array(count, wavelengths * CHIRP.wavelength)
+    board = iw.Radar(linear_array(1, 1.0), row, CHIRP, place, array_window="rectangular")
+    assert find_grating_lobes(board, board.grid(0.5, 4.0)) == pytest.approx(lobes, abs=2e-3)
