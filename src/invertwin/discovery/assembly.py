@@ -15,8 +15,14 @@ from invertwin.discovery.imaging.reflectivity import thin_map
 from invertwin.discovery.memory import SearchMemory
 from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
-from invertwin.inversion import Observation, Optimizer, Reconstruction, Schedule, reconstruct
-from invertwin.inversion.callbacks import Report
+from invertwin.inversion import (
+    Observation,
+    Optimizer,
+    Reconstruction,
+    Report,
+    Schedule,
+    reconstruct,
+)
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.runtime.progress import track
@@ -119,7 +125,7 @@ class ShapeLikelihood:
         """
 
         def compute() -> Tensor:
-            rows = self._background_loss - self.loss.bin_losses(self.predict(shapes), self.power)
+            rows = self._background_loss - self.bin_losses(shapes)
             return rows.flatten(1).double().sum(1) / self.bins_per_draw
 
         return self.memory.recall(self.gains_name, shapes, compute)
@@ -144,9 +150,17 @@ class ShapeLikelihood:
         count = sum(7 if one.is_rectangular else 5 for one in shapes)
         return self.total_gain(shapes) - 0.5 * count * math.log(self.independent_draws)
 
+    def bin_losses(self, shapes: Shapes) -> Float[Tensor, "frame range u v"]:
+        """Compute the negative log-likelihood of shapes in every bin.
+
+        Args:
+            shapes: shape parameters.
+        """
+        return self.loss.bin_losses(self.predict(shapes), self.power)
+
     @cached_property
     def _background_loss(self) -> Tensor:
-        return self.loss.bin_losses(torch.zeros_like(self.power), self.power)
+        return self.bin_losses([])
 
     @property
     def independent_draws(self) -> float:

@@ -1,12 +1,12 @@
 """Uncertainty of shapes: error bars, kinds and existence, from the scatter over frames."""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from torch import Tensor
 
 from invertwin.discovery.assembly import ShapeLikelihood
 from invertwin.discovery.imaging.likelihood import find_grating_lobes
@@ -54,18 +54,6 @@ def standard_deviations(
     return {row.name: float(value) for row, value in zip(rows, error, strict=True)}
 
 
-def acceptance_probability(gains_with: Tensor, gains_without: Tensor) -> float:
-    """Compute the probability that a model change supported by the frames is real.
-
-    Args:
-        gains_with: log-likelihood gains of all frames with the change.
-        gains_without: log-likelihood gains of all frames without the change.
-    """
-    gain = gains_with - gains_without
-    spread = float(gain.std()) * math.sqrt(len(gain))
-    return float(torch.special.ndtr(gain.sum() / max(spread, 1e-9)))
-
-
 def _exchange(shapes: Shapes, number: int, new: ShapeParameters) -> list[ShapeParameters]:
     return [*shapes[:number], new, *shapes[number + 1 :]]
 
@@ -90,13 +78,12 @@ def preference(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> f
         rivals: other shapes.
     """
     if likelihood.radar.frame_count >= _MIN_FRAMES:
-        return acceptance_probability(*map(likelihood.log_likelihood_gains, (shapes, rivals)))
-    new, old = (
-        likelihood.loss.bin_losses(likelihood.predict(row), likelihood.power).double()
-        for row in (shapes, rivals)
-    )
-    gain = old - new
-    spread = float(gain.square().sum() * likelihood.bins_per_draw) ** 0.5
+        new, old = map(likelihood.log_likelihood_gains, (shapes, rivals))
+        spread = float((new - old).std()) * math.sqrt(len(new))
+    else:
+        new, old = (-likelihood.bin_losses(row).double() for row in (shapes, rivals))
+        spread = float((new - old).square().sum() * likelihood.bins_per_draw) ** 0.5
+    gain = new - old
     return float(torch.special.ndtr(gain.sum() / max(spread, 1e-9)))
 
 
@@ -109,13 +96,11 @@ def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list
         likelihood: likelihood of the maps.
         shapes: all shapes.
     """
-    together = likelihood.log_likelihood_gains(shapes)
     without = [[*shapes[:k], *shapes[k + 1 :]] for k in range(len(shapes))]
-    if len(together) < _MIN_FRAMES:
-        evidence = likelihood.evidence(shapes)
-        odds = [evidence - likelihood.evidence(rest) for rest in without]
-        return torch.tensor(odds, dtype=torch.float64).sigmoid().tolist()
-    return [acceptance_probability(together, likelihood.log_likelihood_gains(r)) for r in without]
+    if likelihood.radar.frame_count >= _MIN_FRAMES:
+        return [preference(likelihood, shapes, rest) for rest in without]
+    odds = [likelihood.evidence(shapes) - likelihood.evidence(rest) for rest in without]
+    return torch.tensor(odds, dtype=torch.float64).sigmoid().tolist()
 
 
 @dataclass(frozen=True)
@@ -194,16 +179,13 @@ def rotate_to_lobe(
     old = way / way.norm() @ axes
     new = old + old.new_tensor([0.0, offset, 0.0])
     new[0] = (1 - new[1:].square().sum()).clamp_min(0.0).sqrt().copysign(old[0])
-    old_gain, gain = (
-        float(link.tx_pattern.gain(one[None]) * link.rx_pattern.gain(one[None]))
-        for one in (old, new)
-    )
-    if new[0] == 0 or gain == 0 or shape.kind == "prism":
+    both = torch.stack([old, new])
+    gains = (link.tx_pattern.gain(both) * link.rx_pattern.gain(both)).tolist()
+    if new[0] == 0 or gains[1] == 0 or shape.kind == "prism":
         return None
-    away = way.norm() * axes @ new
-    turns = [math.atan2(float(one[1]), float(one[0])) for one in (way, away)]
-    x, y = (place + away)[:2].tolist()
-    yaw, brightness = shape.yaw + turns[1] - turns[0], shape.brightness * old_gain / gain
+    ends = way.norm() * both @ axes.T
+    turn, (x, y) = torch.atan2(ends[:, 1], ends[:, 0]).diff(), (place + ends[1])[:2].tolist()
+    yaw, brightness = shape.yaw + float(turn), shape.brightness * gains[0] / gains[1]
     return replace(shape, position=(x, y), yaw=yaw, brightness=brightness)
 
 
@@ -213,11 +195,10 @@ def kind_probabilities(hypotheses: Hypotheses) -> dict[str, float]:
     Args:
         hypotheses: hypotheses of a shape.
     """
-    found = dict[str, float]()
+    found = defaultdict[str, float](float)
     for other in hypotheses:
-        kind = other.shape.effective_kind
-        found[kind] = found.get(kind, 0.0) + other.probability
-    return found
+        found[other.shape.effective_kind] += other.probability
+    return dict(found)
 
 
 def widen_deviations(

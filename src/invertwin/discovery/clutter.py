@@ -17,8 +17,7 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion.observation import Unknown, Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
-from invertwin.models.radar import SurrogateMap
-from invertwin.models.whitened import WhitenedMap
+from invertwin.models import SurrogateMap, WhitenedMap
 from invertwin.scene import Material, MaterialValues, Mesh, Object, Scene, signed_distance
 
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such

@@ -19,14 +19,10 @@ from invertwin.errors import InputError
 from invertwin.inversion.loss import CorrelationLoss, CorrelationScale
 from invertwin.inversion.reconstruction import Reconstruction
 from invertwin.models.doppler import RangeDopplerMap
+from invertwin.radar import Radar, ordered_statistics_cfar, point_cloud
 from invertwin.radar.aperture import aperture
 from invertwin.radar.processing import doppler
-from invertwin.radar.processing.detection import ordered_statistics_cfar, point_cloud
-from invertwin.radar.radar import Radar
-from invertwin.scene import RoughDielectric
-from invertwin.scene.mesh import Mesh
-from invertwin.scene.pose import rigid
-from invertwin.scene.scene import Scene
+from invertwin.scene import Mesh, RoughDielectric, Scene, rigid
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,9 +242,8 @@ def detect_strongest_target(
             "record again"
         )
     best = int(strength.argmax())
-    range_, rate, u, v = (
-        float(x[best]) for x in (points.range, points.velocity, points.u, points.v)
-    )
+    columns = points.range, points.velocity, points.u, points.v
+    range_, rate, u, v = (float(column[best]) for column in columns)
     coherence = _channel_coherence(recording, grid, rate, range_)
     return DetectedEcho(range_, rate, u, v, points.position[best], coherence)
 

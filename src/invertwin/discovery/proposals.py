@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.discovery.shapes.primitives import SIZE_LIMITS, ShapeParameters
+from invertwin.discovery.shapes.primitives import SIZE_LIMITS, ShapeParameters, ground_rotation
 from invertwin.inversion.initialisation.detections import label_groups
 
 _YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
@@ -75,16 +75,13 @@ def enclosing_rectangle(
     Returns:
         The tightness is the weighted mean of 1/(d + 3 cm), d the distance to the nearest side.
     """
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y = positions.unbind(1)
-    own = torch.stack([c * x + s * y, c * y - s * x], 1)
+    rotation = ground_rotation(yaw)
+    own = positions @ rotation
     ends = torch.stack([_trimmed_ends(own[:, axis], weight) for axis in range(2)])
     middle, sides = ends.mean(1), ends[:, 1] - ends[:, 0]
     away = (0.5 * sides - (own - middle).abs()).abs().amin(1)
     tight = float((weight / (away + 0.03)).sum() / weight.sum())
-    first, second = middle.tolist()
-    center = c * first - s * second, s * first + c * second
-    return torch.tensor(center, dtype=torch.float64), sides, tight
+    return rotation @ middle, sides, tight
 
 
 def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
@@ -121,11 +118,10 @@ def propose_shapes(
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
         rows.append(ShapeParameters("box", (x, y), turn, length, width, 1.5 * height))
-    spread = max(float(smallest[0][1].mean()), 0.02)
-    x, y = smallest[0][0].tolist()
+    middle, sides, _ = smallest[0]
+    spread, (x, y) = max(float(sides.mean()), 0.02), middle.tolist()
     rows.append(ShapeParameters("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))
     rows.append(ShapeParameters("sphere", (x, y), 0.0, spread, spread, height))
-    middle, sides, _ = smallest[0]
     if float(sides.max()) < MAX_CORNER_EXTENT:
         rows += propose_headings(ShapeParameters("corner", (x, y), height=height))
     around = ShapeParameters("box", (x, y), smallest[1], *sides.clamp_min(0.02).tolist())

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from invertwin.capture import Capture, ChirpCapture
 from invertwin.channel import Grid, ViewpointScene
@@ -39,6 +39,7 @@ _FEW_CHANNELS = 4  # along an axis of the array, whose maps have no taper
 _FINAL_FIT_STEPS = 50  # steps of the final fit
 _MAX_IMAGE_POINTS = 40_000  # maximum number of points of an image
 _MIN_STATED_PROBABILITY = 0.05  # of another place of an object
+_OTHER_PLACE = 0.5  # m, more than hypotheses of one place are apart
 _HELD_OUT_EVERY = 4  # every fourth frame is held out, where there are twice as many
 _Corner = Sequence[float] | None  # x and y [m]; None = all that is seen
 
@@ -254,13 +255,8 @@ def _search_shapes(
 def _state_other_places(among: Sequence[certainty.Hypotheses]) -> Iterator[str]:
     """State where else an object may be if its hypotheses lie apart from its likeliest place."""
     for number, (first, *others) in enumerate(among, 1):
-        size = max(first.shape.length, first.shape.width)
-        far = [
-            one
-            for one in others
-            if math.dist(one.shape.position, first.shape.position)
-            > max(size, one.shape.length, one.shape.width)
-        ]
+        here = first.shape.position
+        far = [one for one in others if math.dist(one.shape.position, here) > _OTHER_PLACE]
         share = sum(one.probability for one in far)
         if share > _MIN_STATED_PROBABILITY:
             place = max(far, key=lambda one: one.probability).shape.position
@@ -384,8 +380,7 @@ def image_points(
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
         steps = [cell * torch.arange(count, dtype=torch.float64) for count in counts]
         flat = torch.cartesian_prod(corners[0][0] + steps[0], corners[0][1] + steps[1])
-        places = torch.zeros(len(flat), 3, dtype=torch.float64)
-        places[:, :2], places[:, 2] = flat, height
+        places = pad(flat, (0, 1), value=height)
         near = torch.zeros(len(flat), dtype=torch.bool)
         for place, axis in _boresights(radar):
             way = places - place

@@ -518,15 +518,13 @@ def enclosing_box(shapes: Shapes, yaw: float) -> ShapeParameters:
         yaw: yaw of the box [rad].
     """
     corners = torch.cat([outline_corners(shape) for shape in shapes])
-    c, s = math.cos(yaw), math.sin(yaw)
-    own = corners @ torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
-    low, high = own.amin(0), own.amax(0)
-    x, y = (0.5 * (low + high)).tolist()
+    rotation = primitives.ground_rotation(yaw)
+    low, high = (corners @ rotation).aminmax(dim=0)
+    x, y = (0.5 * rotation @ (low + high)).tolist()
     length, width = (high - low).tolist()
     brightest = max(shapes, key=lambda one: one.brightness)
     tall = max(shape.height for shape in shapes)
-    position = c * x - s * y, s * x + c * y
-    return ShapeParameters("box", position, yaw, length, width, tall, brightest.brightness)
+    return ShapeParameters("box", (x, y), yaw, length, width, tall, brightest.brightness)
 
 
 def propose_splits(shape: ShapeParameters) -> list[tuple[ShapeParameters, ShapeParameters]]:
@@ -589,7 +587,6 @@ def outline_corners(shape: ShapeParameters, count: int = 16) -> Float64[Tensor, 
     if not shape.is_rectangular:
         turns = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
         return middle + 0.5 * shape.length * torch.stack([turns.cos(), turns.sin()], dim=1)
-    c, s = math.cos(shape.yaw), math.sin(shape.yaw)
     half = 0.5 * torch.tensor([shape.length, shape.width], dtype=torch.float64)
     signs = torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
-    return middle + (signs * half) @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64)
+    return middle + (signs * half) @ primitives.ground_rotation(shape.yaw).T

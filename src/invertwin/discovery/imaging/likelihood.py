@@ -135,8 +135,6 @@ def find_grating_lobes(radar: Radar, grid: Grid) -> list[float]:
         grid: bins of the map.
     """
     axis = direction_axes(radar, grid)[0]
-    if axis.count == 1:
-        return []
     lags = torch.arange(-2.0, 2.0, 1e-3, dtype=torch.float64)
     power = axis.response(lags / axis.step)
     top = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:]) & (power[1:-1] > 0.5)

@@ -12,14 +12,9 @@ from invertwin.channel import Grid
 from invertwin.discovery.imaging.reflectivity import direction_cell
 from invertwin.discovery.outcome import DetectedObject
 from invertwin.inversion.initialisation.detections import label_groups
-from invertwin.radar import (
-    detect_points,
-    noise_power,
-    range_doppler,
-    velocity_axis,
-    velocity_span,
-)
+from invertwin.radar import detect_points, noise_power
 from invertwin.radar.aperture import aperture
+from invertwin.radar.processing import doppler
 from invertwin.radar.processing.backprojection import pairwise_distances
 
 _MAX_GROUP_CELLS = 3.0  # cells of range and rate between echoes of one target
@@ -55,7 +50,7 @@ def detect_moving_targets(
     points = detect_points(beat, radar, grid, chirps, frame)
     if points is None or not len(points.power):
         return []
-    cell = 2 * velocity_span(radar, chirps) / chirps.count
+    cell = 2 * doppler.velocity_span(radar, chirps) / chirps.count
     origin, own_velocity = radar.positions[frame].detach(), platform_velocities(recording)[frame]
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
     rates = points.velocity + aways @ own_velocity
@@ -68,9 +63,9 @@ def detect_moving_targets(
     if not len(rows):
         return []
     labels = label_groups(torch.stack([points.range, rates], dim=1)[rows] / scales, 1.0)
-    flat = range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
+    flat = doppler.range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # With the mean, the noise of range rates near 0 is removed too.
-    noisy = flat[:, velocity_axis(radar, chirps).abs() > 0.75 * cell]
+    noisy = flat[:, doppler.velocity_axis(radar, chirps).abs() > 0.75 * cell]
     # Noise reduction of beams over all channels relative to one channel.
     noise = noise_power(noisy.abs().square(), 1) / len(radar.virtual_positions)
     array, top = aperture(radar), float(points.power[rows].max())

@@ -47,11 +47,7 @@ def fit_outlines(
 
 def _group_touching(shapes: Shapes, max_gap: float) -> list[list[ShapeParameters]]:
     """Group shapes connected by gaps smaller than a limit [m]."""
-    count = len(shapes)
-    near = np.zeros((count, count))
-    for a in range(count):
-        for b in range(a):
-            near[a, b] = shape_gap(shapes[a], shapes[b]) < max_gap
+    near = np.array([[shape_gap(a, b) < max_gap for b in shapes] for a in shapes])
     total, labels = connected_components(near, directed=False)
     return [[shapes[k] for k in np.flatnonzero(labels == part).tolist()] for part in range(total)]
 

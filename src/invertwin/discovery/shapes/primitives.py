@@ -316,14 +316,21 @@ def rotate_shape(shape: ShapeParameters, rotation: float) -> ShapeParameters:
         shape: shape parameters.
         rotation: increase of its yaw [rad].
     """
-    unit = _unit_mesh(shape.kind).vertices.mean(0)[:2]
-    x, y = (unit * torch.tensor([shape.length, shape.width], dtype=torch.float64)).tolist()
-    rows = [
-        (math.cos(a) * x - math.sin(a) * y, math.sin(a) * x + math.cos(a) * y)
-        for a in (shape.yaw, shape.yaw + rotation)
-    ]
-    first, second = (p + a - b for p, a, b in zip(shape.position, *rows, strict=True))
-    return replace(shape, position=(first, second), yaw=shape.yaw + rotation)
+    unit, yaw = _unit_mesh(shape.kind).vertices.mean(0)[:2], shape.yaw + rotation
+    mean = unit * torch.tensor([shape.length, shape.width], dtype=torch.float64)
+    shift = (ground_rotation(shape.yaw) - ground_rotation(yaw)) @ mean
+    x, y = (torch.tensor(shape.position, dtype=torch.float64) + shift).tolist()
+    return replace(shape, position=(x, y), yaw=yaw)
+
+
+def ground_rotation(yaw: float) -> Float64[Tensor, "2 2"]:
+    """Return the rotation by a yaw of x and y.
+
+    Args:
+        yaw: angle from x towards y [rad].
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    return torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
 
 
 @cache

@@ -53,9 +53,7 @@ def merge_into_prism(shapes: primitives.Shapes, level: float, spacing: float) ->
         float(m) + step * (torch.arange(n, dtype=torch.float64) - 0.5 * (n - 1))
         for m, n in zip(middle, counts, strict=True)
     ]
-    grid_points = torch.cartesian_prod(*lines)
-    nodes = torch.zeros(len(grid_points), 3, dtype=torch.float64)
-    nodes[:, :2] = grid_points
+    nodes = nn.functional.pad(torch.cartesian_prod(*lines), (0, 1))
     parts: list[Tensor] = []
     for mesh in meshes:
         nodes[:, 2] = 0.5 * (mesh.vertices[:, 2].amin() + mesh.vertices[:, 2].amax())
