@@ -58,11 +58,6 @@ def _exchange(shapes: Shapes, number: int, new: ShapeParameters) -> list[ShapePa
     return [*shapes[:number], new, *shapes[number + 1 :]]
 
 
-def _odds_against(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> float:
-    right = min(max(preference(likelihood, shapes, rivals), 1e-6), 1 - 1e-6)
-    return (1 - right) / right
-
-
 def preference(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> float:
     """Compute the probability that one set of shapes, rather than another, made the maps.
 
@@ -83,8 +78,8 @@ def preference(likelihood: ShapeLikelihood, shapes: Shapes, rivals: Shapes) -> f
     else:
         new, old = (-likelihood.bin_losses(row).double() for row in (shapes, rivals))
         spread = float((new - old).square().sum() * likelihood.bins_per_draw) ** 0.5
-    gain = new - old
-    return float(torch.special.ndtr(gain.sum() / max(spread, 1e-9)))
+    right = torch.special.ndtr((new - old).sum() / max(spread, 1e-9))
+    return float(right.clamp(1e-6, 1 - 1e-6))
 
 
 def existence_probabilities(likelihood: ShapeLikelihood, shapes: Shapes) -> list[float]:
@@ -140,14 +135,14 @@ def find_hypotheses(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Sh
             # The first steps of a short fit may lower the likelihood.
             options = [_exchange(shapes, number, one) for one in (start, new)]
             swapped = max(options, key=likelihood.total_gain)
-            odds = _odds_against(likelihood, shapes, swapped)
+            odds = 1 / preference(likelihood, shapes, swapped) - 1
             found[number].append(ShapeHypothesis(swapped[number], odds))
     lobes = find_grating_lobes(likelihood.radar, likelihood.model.grid)
     for (number, row), offset in product(list(enumerate(map(tuple, found))), lobes):
         if (turned := rotate_to_lobe(likelihood, shapes[number], offset)) is None:
             continue
         # The array distinguishes kinds there as here.
-        odds = _odds_against(likelihood, shapes, _exchange(shapes, number, turned))
+        odds = 1 / preference(likelihood, shapes, _exchange(shapes, number, turned)) - 1
         for other in row:
             moved = rotate_to_lobe(likelihood, other.shape, offset) or turned
             found[number].append(ShapeHypothesis(moved, odds * other.probability))
@@ -221,10 +216,8 @@ def widen_deviations(
         distance = float((likelihood.radar.positions.detach() - middle).norm(dim=1).mean())
         farther = deviations["height"] ** 2 / (2 * distance)
     for number, axis in enumerate("xy"):
-        away = sum(
-            r.probability * (r.shape.position[number] - figure.position[number]) ** 2
-            for r in hypotheses
-        )
+        here = figure.position[number]
+        away = sum(r.probability * (r.shape.position[number] - here) ** 2 for r in hypotheses)
         found[axis] = math.hypot(deviations[axis], math.sqrt(away), farther)
     return found
 

@@ -70,18 +70,14 @@ def reconstruct_among_clutter(
     sensors = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
     stages = make_stages(schedule, [*unknowns, *(name for own in sensors for name in own)])
     if any(stage.frames_per_step is not None or stage.rebuilds_modules for stage in stages):
-        raise InputError(
-            "expected all frames and the same parameters in every step, got frames_per_step or a "
-            "stage that rebuilds: clutter is of all frames; leave them out"
-        )
+        wanted = "expected all frames, of which clutter is, and the same parameters in every step"
+        raise InputError(f"{wanted}, got frames_per_step or a stage that rebuilds; leave them out")
     fit = inversion.prepare_fit(scene, given, unknowns)
     objects, present = fit.apply_modules()[0].objects, fit.twin()
     fitted = [name for name, item in objects.items() if item.vertices.requires_grad]
     if not fitted:
-        raise InputError(
-            "expected a parameter that moves an object, got none: clutter is what is away from the "
-            "fitted objects; give a Pose or a shape, or use reconstruct"
-        )
+        wanted = "expected a parameter that moves an object, away from which clutter is, got none"
+        raise InputError(f"{wanted}; give a Pose or a shape, or use reconstruct")
 
     def fit_rounds(unknowns: dict[str, Unknown], first: int) -> inversion.Reconstruction:
         """Fit among clutter about the start, and again, without blur, about the end."""
@@ -135,10 +131,9 @@ def _find_rivals(
         share = float(clutter.echoes.sum()) / _predict_power_of(fitted, scene, observation, seed)
         if share > _RIVAL_SHARE:
             place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
-            yield (
-                f"unmodelled echoes have {min(share, 999.0):.2g} times the "
-                f"power of the fitted objects, strongest at ({place}) m: they may be parts of these"
-            )
+            times = f"{min(share, 999.0):.2g} times the power of the fitted objects"
+            end = f"strongest at ({place}) m: they may be parts of these"
+            yield f"unmodelled echoes have {times}, {end}"
 
 
 def _predict_power_of(

@@ -76,10 +76,9 @@ class SearchMemory:
         with convert_read_errors(file, "a whole checkpoint", "delete it or start without resume"):
             stored = json.loads(read_text(file, "a checkpoint"))
             if not search.matches(stored["search"]):
-                raise InputError(
-                    f"expected a checkpoint of this search in {file}, got one of another "
-                    "(recording, region, level, rays or seed differ); start without resume"
-                )
+                differ = "recording, region, level, rays or seed differ"
+                told = f"expected a checkpoint of this search in {file}, got one of another"
+                raise InputError(f"{told} ({differ}); start without resume")
             for name, shapes, value in stored["results"]:
                 fitted = bool(value) and isinstance(value[0], dict)
                 result = _read_shapes(value) if fitted else torch.tensor(value, dtype=torch.float64)

@@ -92,10 +92,8 @@ class MovingBody(nn.Module):
         self.object, self.echo = object, echo
         share = _require_rough_dielectric(scene, object).diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
-            raise InputError(
-                f"expected a number between 0 and 1 as the diffuse share of {object}, got {share}; "
-                "0.5 is a start"
-            )
+            wanted = f"expected a diffuse share between 0 and 1 of {object}"
+            raise InputError(f"{wanted}, got {share}; 0.5 is a start")
         link = radar.link()
         along = echo.position - 0.5 * (link.tx + link.rx)[0]
         along = along / along.norm()
@@ -171,14 +169,12 @@ def _require_rough_dielectric(scene: Scene, name: str) -> RoughDielectric:
     material = scene[name].material
     if isinstance(material, RoughDielectric):
         return material
-    raise InputError(
-        f"expected a rough_dielectric for {name}, got {type(material).__name__}; its echo has the "
-        "diffuse and the glossy part that the fit weighs"
-    )
+    wanted = f"expected a rough_dielectric for {name}, got {type(material).__name__}"
+    raise InputError(f"{wanted}; its echo has the diffuse and the glossy part that the fit weighs")
 
 
-# Cells of a map that an echo and its neighbours fill; and those that the noise is taken from.
-_GUARD_CELLS, _TRAINING_CELLS = 2, 2
+# Cells of a map that an echo and its neighbours fill, and as many that the noise is taken from.
+_CFAR_CELLS = 2
 _FALSE_ALARM_RATE = 1e-6
 _RAY_COUNT = 10_000  # of a map that is compared or drawn
 
@@ -223,13 +219,10 @@ def detect_strongest_target(
     """
     radar, chirps, grid = recording.radar(), model.chirps, model.grid
     bins = model.bins / chirps.count, radar.waveform.range_resolution / grid.range_step
-    guard, training = (
-        (max(1, round(n * bins[0])), max(1, round(n * bins[1])))
-        for n in (_GUARD_CELLS, _TRAINING_CELLS)
-    )
+    near = max(1, round(_CFAR_CELLS * bins[0])), max(1, round(_CFAR_CELLS * bins[1]))
     power = model.observe(recording).detach()
     seen = ordered_statistics_cfar(
-        power.amax((-2, -1)), guard=guard, training=training, false_alarm=_FALSE_ALARM_RATE
+        power.amax((-2, -1)), guard=near, training=near, false_alarm=_FALSE_ALARM_RATE
     )
     points = point_cloud(power, seen, radar, grid, chirps)
     strength = points.power
@@ -237,10 +230,7 @@ def detect_strongest_target(
         outside = (points.position < box[0]) | (points.position > box[1])
         strength = strength.masked_fill(outside.any(1), 0.0)
     if not bool((strength > 0).any()):
-        raise InputError(
-            "expected something that moves, got no echo above the noise; widen the grid, or "
-            "record again"
-        )
+        raise InputError("expected a moving target, got no echo above the noise; widen the grid")
     best = int(strength.argmax())
     columns = points.range, points.velocity, points.u, points.v
     range_, rate, u, v = (float(column[best]) for column in columns)

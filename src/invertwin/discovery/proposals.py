@@ -52,14 +52,10 @@ def group_bright_points(
     bright = weight.nonzero()[:, 0]
     if not len(bright):
         return []
-    labels = label_groups(positions[bright], max_gap)
-    found = []
-    for number in range(int(labels.max()) + 1):
-        own = torch.zeros_like(weight)
-        rows = bright[labels == number]
-        own[rows] = weight[rows]
-        found.append(own)
-    return sorted(found, key=lambda own: -float(own.sum()))
+    labels = torch.full_like(weight, -1.0).long()
+    labels[bright] = label_groups(positions[bright], max_gap)
+    groups = (torch.where(labels == k, weight, 0.0) for k in range(int(labels.max()) + 1))
+    return sorted(groups, key=lambda own: -float(own.sum()))
 
 
 def enclosing_rectangle(
@@ -145,11 +141,9 @@ def propose_people_and_vehicles(box: ShapeParameters) -> list[ShapeParameters]:
     """
     long, short = max(box.length, box.width), min(box.length, box.width)
     rows: list[ShapeParameters] = []
-    if (
-        _MIN_PERSON_EXTENT < long < _PERSON_SIZE[1] + _PERSON_MARGIN
-        and short < _PERSON_SIZE[0] + _PERSON_MARGIN
-    ):
-        length, width, height = _PERSON_SIZE
+    length, width, height = _PERSON_SIZE
+    slim = short < length + _PERSON_MARGIN
+    if slim and _MIN_PERSON_EXTENT < long < width + _PERSON_MARGIN:
         upright = replace(box, kind="person", length=length, width=width, height=height)
         rows += propose_headings(upright)
     (low, _, _), (high, wide, height) = SIZE_LIMITS["vehicle"]

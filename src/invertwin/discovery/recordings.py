@@ -236,10 +236,8 @@ def _search_shapes(
         seen_there = compute_response(aside.radar, there.grid, positions)
         powers = torch.zeros_like(there.power), seen_there.predict_maps(search.first_image)
         nothing, image = (there.loss.bin_losses(power, there.power) for power in powers)
-        gain = float((nothing - image).sum()) / likelihoods.count_bins_per_draw(
-            likelihoods.map_axes(aside.radar, there.grid)
-        )
-        if gain > aside.total_gain(shapes):
+        draw = likelihoods.count_bins_per_draw(likelihoods.map_axes(aside.radar, there.grid))
+        if float((nothing - image).sum()) / draw > aside.total_gain(shapes):
             notes = (_NOTES["image_better"],)
     shapes, found = one.fit(shapes, _FINAL_FIT_STEPS)
     among = certainty.find_hypotheses(one, shapes)
@@ -316,10 +314,8 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         longest = float(capture.ranges[-1]) - cell
     limit = longest if range_max is None else min(range_max, longest)
     if not first < limit:
-        raise InputError(
-            f"expected range_max beyond the leakage, which ends at {first:.3g} m, got {limit:.3g}; "
-            "give a larger one"
-        )
+        wanted = f"expected range_max beyond the leakage, which ends at {first:.3g} m"
+        raise InputError(f"{wanted}, got {limit:.3g}; give a larger one")
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     strongest, chance, note = _relate_to_noise(power, radar, grid)
@@ -345,9 +341,8 @@ def _relate_to_noise(
 def _estimate_background(
     power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
 ) -> Float64[Tensor, " range"]:
-    return likelihoods.estimate_background(
-        power, likelihoods.count_bins_per_draw(likelihoods.direction_axes(radar, grid))
-    )
+    directions = likelihoods.count_bins_per_draw(likelihoods.direction_axes(radar, grid))
+    return likelihoods.estimate_background(power, directions)
 
 
 def image_points(
@@ -371,10 +366,8 @@ def image_points(
             corners[k] = checked_tensor(given, (2,), "corner of the region [m]", "give two numbers")
     size = corners[1] - corners[0]
     if not bool((size > 0).all()):
-        raise InputError(
-            f"expected low below high, got {corners[0].tolist()} and {corners[1].tolist()}; give "
-            "opposite corners of the region"
-        )
+        told = f"expected low below high, got {corners[0].tolist()} and {corners[1].tolist()}"
+        raise InputError(f"{told}; give opposite corners of the region")
     cell = radar.waveform.range_resolution
     while True:
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]

@@ -198,11 +198,9 @@ class ShapeSearch:
             index = int(best.argmax())
             x, y = grid.positions[index].tolist()
             corner = ShapeParameters("corner", (x, y), yaws[int(yaw[index])])
-            options = [
-                replace(corner, height=part * grid.height, brightness=brightness)
-                for part in (0.6, 1.0, 1.5)
-                for brightness in (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-            ]
+            tried = product((0.6, 1.0, 1.5), (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0))
+            high = grid.height
+            options = [replace(corner, height=k * high, brightness=b) for k, b in tried]
             known = [*shapes, *found]
             new = self.select_best(known, options)
             for _ in range(2):
@@ -375,11 +373,8 @@ class ShapeSearch:
         """
         found, tried = list(shapes), set[tuple[ShapeParameters, ShapeParameters]]()
         while True:
-            pairs = [
-                (a, b)
-                for a, b in combinations(found, 2)
-                if (a, b) not in tried and shape_gap(a, b) < _MAX_MERGE_GAP
-            ]
+            pairs = [two for two in combinations(found, 2) if two not in tried]
+            pairs = [two for two in pairs if shape_gap(*two) < _MAX_MERGE_GAP]
             if not pairs:
                 return found
             a, b = min(pairs, key=lambda pair: shape_gap(*pair))
@@ -567,11 +562,11 @@ def shape_gap(first: ShapeParameters, second: ShapeParameters) -> float:
         first, second: shape parameters.
     """
     share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
-    sides: list[Tensor] = []
-    for shape in (first, second):
-        corners = outline_corners(shape)
-        sides.append((corners + share * (corners.roll(1, 0) - corners)).flatten(0, 1))
-    return float(torch.cdist(sides[0], sides[1]).min())
+    a, b = (
+        (corners + share * (corners.roll(1, 0) - corners)).flatten(0, 1)
+        for corners in map(outline_corners, (first, second))
+    )
+    return float(torch.cdist(a, b).min())
 
 
 def outline_corners(shape: ShapeParameters, count: int = 16) -> Float64[Tensor, "corner 2"]:

@@ -129,11 +129,8 @@ def _update_tracks(
             spread = one.matrix @ error @ one.matrix.T + one.noise
             away[row, column] = off @ torch.linalg.solve(spread, off)
     rows, columns = linear_sum_assignment(away.clamp_max(2 * _MAX_SQUARED_DISTANCE).numpy())
-    pairs = {
-        int(a): int(b)
-        for a, b in zip(rows, columns, strict=True)
-        if away[a, b] < _MAX_SQUARED_DISTANCE
-    }
+    near = away.numpy()[rows, columns] < _MAX_SQUARED_DISTANCE
+    pairs = dict(zip(rows[near].tolist(), columns[near].tolist(), strict=True))
     for row, path in enumerate(active_tracks):
         state, error = path.predictions[-1]
         if row not in pairs:

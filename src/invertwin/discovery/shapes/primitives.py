@@ -261,14 +261,10 @@ class PrimitiveModel(UnknownShape):
 
     def values(self) -> dict[str, Tensor]:
         """Return the fitted values by name, in SI units."""
-        found = self.shape
-        numbers = {
-            "place": found.position,
-            "yaw": found.yaw,
-            "size": (found.length, found.width, found.height),
-            "brightness": found.brightness,
-        }
-        return {f"{self.object}.{n}": torch.tensor(v) for n, v in numbers.items()}
+        found, names = self.shape, ("place", "yaw", "size", "brightness")
+        size = found.length, found.width, found.height
+        values = map(torch.tensor, (found.position, found.yaw, size, found.brightness))
+        return {f"{self.object}.{n}": value for n, value in zip(names, values, strict=True)}
 
     def coordinates(self) -> list[Coordinate]:
         """Return position, yaw, size and brightness, as far as the shape has them."""
