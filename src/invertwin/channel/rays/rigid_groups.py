@@ -47,7 +47,7 @@ def find_rigid_groups(
     """
     fixed = [strip_derivatives(points) for points in vertices]
     moves = np.array([is_differentiated(points) for points in vertices])
-    start, points = np.cumsum([0, *map(len, fixed)])[:-1], torch.cat(fixed).numpy()
+    start, points = np.cumsum([0, *map(len, fixed)])[:-1], np.concatenate(fixed)
     low, high = (f.reduceat(points, start) for f in (np.minimum, np.maximum))
     size = np.linalg.norm(high - low, axis=1)
     reach = mesh_topology.CRACK_TOLERANCE * size[:, None]
@@ -116,7 +116,8 @@ def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"])
     Args:
         before, after: positions [m].
     """
-    if before.shape != after.shape or torch.equal(before, after):
+    # Between other work torch's threads would wait for each other ten times longer.
+    if before.shape != after.shape or np.array_equal(before, after):
         return before.shape == after.shape
     one, other = before - before.mean(0), after - after.mean(0)
     u, _, v = torch.linalg.svd(one.T @ other)

@@ -109,12 +109,12 @@ class Topology:
         return points.index_put((vertex,), moved)
 
     @cached_property
-    def _seams(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _seams(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices of triangles, those of the same object that they count as, and their gaps."""
         (faces, points), welded, owner = self._built, self.welded_faces, self.vertex_object
         seam = (welded != faces) & (owner[welded] == owner[faces])
         one, other = faces[seam], welded[seam]
-        return one, other, (points[one] - points[other]).norm(dim=1)
+        return one.numpy(), other.numpy(), (points[one] - points[other]).norm(dim=1).numpy()
 
     def keeps_seams(self, parts: Sequence[Float64[Tensor, "_ 3"]]) -> bool:
         """Test that vertices of an object that count as one are as close as they were.
@@ -125,9 +125,9 @@ class Topology:
         one, other, gap = self._seams
         if not len(one):
             return True
-        points = torch.cat([strip_derivatives(part) for part in parts])
-        tolerance = mesh_topology.CRACK_TOLERANCE * (points.amax(0) - points.amin(0)).norm()
-        return bool(((points[one] - points[other]).norm(dim=1) <= gap + tolerance).all())
+        points = np.concatenate([strip_derivatives(part).numpy() for part in parts])
+        tolerance = mesh_topology.CRACK_TOLERANCE * np.linalg.norm(np.ptp(points, axis=0))
+        return bool((np.linalg.norm(points[one] - points[other], axis=1) <= gap + tolerance).all())
 
     @cached_property
     def face_edges(self) -> Int64[Tensor, "f 3"]:
