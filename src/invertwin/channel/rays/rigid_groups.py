@@ -116,12 +116,13 @@ def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"])
     Args:
         before, after: positions [m].
     """
-    # Between other work torch's threads would wait for each other ten times longer.
+    # In NumPy, where torch's threads wait longer for each other than they work, and with means as
+    # products, ten times faster than along the axis.
     if before.shape != after.shape or np.array_equal(before, after):
         return before.shape == after.shape
-    one, other = before - before.mean(0), after - after.mean(0)
-    u, _, v = torch.linalg.svd(one.T @ other)
-    return bool((one @ (u @ v) - other).abs().amax() <= _SAME_PLACE * other.abs().amax())
+    one, other = (p - np.full(len(p), 1 / len(p)) @ p for p in (before.numpy(), after.numpy()))
+    u, _, v = np.linalg.svd(one.T @ other)
+    return bool(np.abs(one @ (u @ v) - other).max() <= _SAME_PLACE * np.abs(other).max())
 
 
 def _move_as_one(first: Float64[Tensor, "n 3"], second: Float64[Tensor, "n 3"]) -> bool:
