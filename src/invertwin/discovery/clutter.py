@@ -70,14 +70,14 @@ def reconstruct_among_clutter(
     sensors = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
     stages = make_stages(schedule, [*unknowns, *(name for own in sensors for name in own)])
     if any(stage.frames_per_step is not None or stage.rebuilds_modules for stage in stages):
-        wanted = "expected all frames and the same parameters in every step"
-        raise InputError(f"{wanted}, got frames_per_step or a stage that rebuilds; leave them out")
+        problem = "expected all frames and the same parameters in every step"
+        raise InputError(f"{problem}, got frames_per_step or a stage that rebuilds; leave them out")
     fit = inversion.prepare_fit(scene, given, unknowns)
     objects, present = fit.apply_modules()[0].objects, fit.twin()
     fitted = [name for name, item in objects.items() if item.vertices.requires_grad]
     if not fitted:
-        wanted = "expected a parameter that moves an object, away from clutter, got none"
-        raise InputError(f"{wanted}; give a Pose or a shape, or use reconstruct")
+        problem = "expected a parameter that moves an object, away from clutter, got none"
+        raise InputError(f"{problem}; give a Pose or a shape, or use reconstruct")
 
     def fit_rounds(unknowns: dict[str, Unknown], first: int) -> inversion.Reconstruction:
         """Fit among clutter about the start, and again, without blur, about the end."""

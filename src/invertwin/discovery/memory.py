@@ -77,8 +77,8 @@ class SearchMemory:
             stored = json.loads(read_text(file, "a checkpoint"))
             if not search.matches(stored["search"]):
                 differ = "recording, region, level, rays or seed differ"
-                told = f"expected a checkpoint of this search in {file}, got one of another"
-                raise InputError(f"{told} ({differ}); start without resume")
+                problem = f"expected a checkpoint of this search in {file}, got one of another"
+                raise InputError(f"{problem} ({differ}); start without resume")
             for name, shapes, value in stored["results"]:
                 fitted = bool(value) and isinstance(value[0], dict)
                 result = _read_shapes(value) if fitted else torch.tensor(value, dtype=torch.float64)

@@ -92,8 +92,8 @@ class MovingBody(nn.Module):
         self.object, self.echo = object, echo
         share = _require_rough_dielectric(scene, object).diffuse
         if not isinstance(share, float | int) or not 0 < share < 1:
-            wanted = f"expected a diffuse share between 0 and 1 of {object}"
-            raise InputError(f"{wanted}, got {share}; 0.5 is a start")
+            problem = f"expected a diffuse share between 0 and 1 of {object}"
+            raise InputError(f"{problem}, got {share}; 0.5 is a start")
         link = radar.link()
         along = echo.position - 0.5 * (link.tx + link.rx)[0]
         along = along / along.norm()
@@ -169,8 +169,8 @@ def _require_rough_dielectric(scene: Scene, name: str) -> RoughDielectric:
     material = scene[name].material
     if isinstance(material, RoughDielectric):
         return material
-    wanted = f"expected a rough_dielectric for {name}, got {type(material).__name__}"
-    raise InputError(f"{wanted}; its echo has the diffuse and the glossy part that the fit weighs")
+    problem = f"expected a rough_dielectric for {name}, got {type(material).__name__}"
+    raise InputError(f"{problem}; its echo has the diffuse and the glossy part that the fit weighs")
 
 
 # Cells of a map that an echo and its neighbours fill, and as many that the noise is taken from.

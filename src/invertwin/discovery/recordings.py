@@ -314,8 +314,8 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         longest = float(capture.ranges[-1]) - cell
     limit = longest if range_max is None else min(range_max, longest)
     if not first < limit:
-        wanted = f"expected range_max beyond the leakage, which ends at {first:.3g} m"
-        raise InputError(f"{wanted}, got {limit:.3g}; give a larger one")
+        problem = f"expected range_max beyond the leakage, which ends at {first:.3g} m"
+        raise InputError(f"{problem}, got {limit:.3g}; give a larger one")
     grid = radar.grid(first, limit)
     power = capture.spectrum(grid).detach().double()
     strongest, chance, note = _relate_to_noise(power, radar, grid)
@@ -366,8 +366,8 @@ def image_points(
             corners[k] = checked_tensor(given, (2,), "corner of the region [m]", "give two numbers")
     size = corners[1] - corners[0]
     if not bool((size > 0).all()):
-        told = f"expected low below high, got {corners[0].tolist()} and {corners[1].tolist()}"
-        raise InputError(f"{told}; give opposite corners of the region")
+        problem = f"expected low below high, got {corners[0].tolist()} and {corners[1].tolist()}"
+        raise InputError(f"{problem}; give opposite corners of the region")
     cell = radar.waveform.range_resolution
     while True:
         counts = [max(2, math.ceil(float(side) / cell) + 1) for side in size]
