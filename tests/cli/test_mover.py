@@ -102,7 +102,10 @@ def test_the_run_file_holds_what_its_note_says(repository, data_folder, tmp_path
         ),
         (('folder = "openradar"', 'folder = "elsewhere"'), "github.com/PreSenseRadar/OpenRadar"),
         (('folder = "openradar"', 'folder = "openradar"\nboard = { name = "xWR1443" }'), "board"),
-        (("diffuse = 0.5", "diffuse = 1.0"), "scene.mover: expected a number between 0 and 1"),
+        (
+            ("diffuse = 0.5", "diffuse = 1.0"),
+            "scene.mover: expected a diffuse share between",
+        ),
     ],
 )
 def test_run_files_that_ask_for_something_else_are_refused(
