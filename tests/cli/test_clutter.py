@@ -107,6 +107,24 @@ def test_a_stranger_counts_as_clutter_where_the_fit_without_is_inconsistent(
 
 
 @pytest.mark.slow
+def test_a_darker_object_gets_its_permittivity_before_clutter(tmp_path, monkeypatch, capsys):
+    """It would otherwise rotate its faces away from the radar."""
+    dark = '[truth.letter]\nmaterial = { kind = "rough_dielectric", permittivity = 1.8 }\n'
+    text = RUN.replace("position = [2.2, 0.65, 0.0]", "position = [-4.9, 0.0, 0.0]")
+    text = text.replace("steps = 10", "steps = 20")
+    (tmp_path / "run.toml").write_text(text.replace("[truth.letter]\n", dark))
+    run = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]
+    assert call(monkeypatch, *run) == 0, capsys.readouterr().err
+    found = read_metrics(tmp_path / "out")
+    (plain,), (bright,) = found["starts"], found["starts_with_permittivities"]
+    assert found["verdict"] == "consistent"
+    assert found["position_error_m"] == bright["position_error_m"] < plain["position_error_m"]
+    deviation = found["standard_deviations"]["letter.permittivity"]
+    assert abs(bright["values"]["letter.permittivity"] - 1.8) < 3 * deviation < 1.5
+    assert "starts_among_clutter" not in found
+
+
+@pytest.mark.slow
 def test_without_clutter_on_request(tmp_path, monkeypatch, capsys):
     (tmp_path / "run.toml").write_text(RUN + 'clutter = "never"\n')
     run = ["reconstruct", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]

@@ -5,7 +5,11 @@ from invertwin.discovery.clutter import Clutter as Clutter
 from invertwin.discovery.clutter import choose_result as choose_result
 from invertwin.discovery.clutter import estimate_clutter as estimate_clutter
 from invertwin.discovery.clutter import needs_clutter as needs_clutter
+from invertwin.discovery.clutter import needs_permittivities as needs_permittivities
 from invertwin.discovery.clutter import reconstruct_among_clutter as reconstruct_among_clutter
+from invertwin.discovery.clutter import (
+    reconstruct_with_permittivities as reconstruct_with_permittivities,
+)
 from invertwin.discovery.movers import DetectedEcho as DetectedEcho
 from invertwin.discovery.movers import MovingBody as MovingBody
 from invertwin.discovery.movers import MovingTargetFit as MovingTargetFit

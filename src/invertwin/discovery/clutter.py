@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,10 +16,11 @@ from invertwin.discovery.imaging.reflectivity import compute_response, reconstru
 from invertwin.discovery.recordings import image_points
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
+from invertwin.inversion.confidence.uncertainty import find_known_permittivities
 from invertwin.inversion.observation import Unknown, Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models import SurrogateMap, WhitenedMap
-from invertwin.scene import Material, MaterialValues, Mesh, Object, Scene, signed_distance
+from invertwin.scene import MaterialValues, Mesh, Object, Scene, signed_distance
 
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
 # as a letter with a wrong rotation.
@@ -43,8 +45,8 @@ def reconstruct_among_clutter(
     Unmodelled echoes are added as background, except around the fitted objects, see
     ``estimate_clutter``. A second fit, without blur, starts from the result of the first, with the
     clutter estimated there. If the result is inconsistent with the data, and the scene has objects
-    that are not fitted, both fits are repeated with free permittivities of the fitted objects: an
-    object that is too bright would otherwise rotate its faces away from the radar.
+    that are not fitted, both fits are repeated with free permittivities of the fitted objects, see
+    ``reconstruct_with_permittivities``.
 
     Args:
         scene: initial scene.
@@ -53,7 +55,8 @@ def reconstruct_among_clutter(
         schedule: schedule of each fit, or its stages; all frames in every step.
         seed: seed of all random numbers.
         callbacks: observers of each fit, given its number: 0 and 1, 2 and 3 with permittivities.
-        always: False = only if a fit without clutter is inconsistent; the better fit is returned.
+        always: False = only if the data contradict a fit without clutter and, of that fit with free
+            permittivities, if they contradict the first; the better fit is returned.
         options: further options of ``reconstruct``.
 
     Raises:
@@ -63,8 +66,14 @@ def reconstruct_among_clutter(
     given = list(observations) if isinstance(observations, Sequence) else [observations]
     unknowns, plain = name_unknowns(parameters), None
     if not always:
-        own = copy.deepcopy(unknowns)
-        plain = inversion.reconstruct(scene, given, own, schedule=schedule, seed=seed, **options)
+        how: dict[str, Any] = {"schedule": schedule, "seed": seed, **options}
+        plain = inversion.reconstruct(scene, given, copy.deepcopy(unknowns), **how)
+        if not needs_permittivities(plain):
+            return plain
+        with suppress(InputError):  # the data do not determine permittivities
+            bright = reconstruct_with_permittivities(scene, given, copy.deepcopy(unknowns), **how)
+            if not needs_clutter(bright):
+                return bright
         if not needs_clutter(plain):
             return plain
     sensors = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
@@ -96,20 +105,48 @@ def reconstruct_among_clutter(
         return found
 
     again, found = copy.deepcopy(unknowns), fit_rounds(unknowns, 0)
-    if needs_clutter(found) and len(fitted) < len(objects):  # others determine the gain
-        free = _free_permittivities({name: objects[name].material for name in fitted})
-        bright = fit_rounds(again | free, 2) if free else found
+    if needs_clutter(found) and (free := _free_permittivities(fit)):
+        bright = fit_rounds(again | free, 2)
         if any(_has_moved(bright, key, objects) for key in free):
             found = choose_result(found, bright)
     found = replace(found, doubts=tuple(_find_rivals(found.scene, given, fitted, seed)))
     return found if plain is None else choose_result(plain, found)
 
 
-def _free_permittivities(materials: Mapping[str, Material]) -> dict[str, Unknown]:
-    """Permittivities that are plain numbers, as unknowns."""
-    found = {name: vars(item).get("permittivity") for name, item in materials.items()}
-    own = {n: value for n, value in found.items() if isinstance(value, float) and value > 1}
-    return {f"{n}.permittivity": Unknown(MaterialValues(n, permittivity=e)) for n, e in own.items()}
+def reconstruct_with_permittivities(
+    scene: Scene,
+    observations: Sequence[inversion.Observation],
+    parameters: Unknowns,
+    **options: Any,
+) -> inversion.Reconstruction:
+    """Fit objects together with their permittivities, which determine how bright they are.
+
+    An object that is brighter in the model than in the data otherwise rotates its faces away from
+    the radar.
+
+    Args:
+        scene: initial scene.
+        observations: recordings.
+        parameters: modules Scene → Scene, as for ``reconstruct``.
+        options: further options of ``reconstruct``.
+
+    Raises:
+        InputError: as ``reconstruct``; all objects are fitted, which leaves the gain unknown, or no
+            fitted object has a known permittivity.
+    """
+    unknowns = name_unknowns(parameters)
+    free = _free_permittivities(inversion.prepare_fit(scene, observations, unknowns))
+    if not free:
+        problem = "expected a fitted object of known permittivity beside one that is not fitted"
+        raise InputError(f"{problem}, got none; use reconstruct")
+    return inversion.reconstruct(scene, observations, unknowns | free, **options)
+
+
+def _free_permittivities(fit: inversion.Fit) -> dict[str, Unknown]:
+    """Permittivities that determine how bright moved objects are, as unknowns."""
+    known = find_known_permittivities(fit)
+    values = {f"{n}.permittivity": MaterialValues(n, permittivity=e) for n, e in known.items()}
+    return {name: Unknown(module) for name, module in values.items()}
 
 
 def _has_moved(found: inversion.Reconstruction, key: str, before: Mapping[str, Object]) -> bool:
@@ -157,6 +194,17 @@ def _whiten(models: Sequence[ForwardModel], backgrounds: Sequence[Tensor]) -> li
 def needs_clutter(found: inversion.Reconstruction) -> bool:
     """True if the data are not consistent with a result, so that a fit among clutter may help."""
     return found.verdict.word in ("inconsistent", "worse", "at a bound")
+
+
+def needs_permittivities(found: inversion.Reconstruction) -> bool:
+    """True if the data contradict a result, or a permittivity that it holds."""
+    if needs_clutter(found):
+        return True
+    try:
+        contradicted = found.uncertainty.contradicted
+    except InputError:  # error bars are not available
+        return False
+    return any(name.endswith(".permittivity") for name in contradicted)
 
 
 def choose_result(

@@ -119,8 +119,10 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     wanted = problem.run.fit_settings.clutter
     if wanted == "never" or not problem.kind.allows_clutter(problem):
         return fits
-    if wanted == "auto" and not discovery.needs_clutter(fits.found):
-        return fits
+    if wanted == "auto":
+        fits = _fit_permittivities(fits, folder, console)
+        if not discovery.needs_clutter(fits.found):
+            return fits
     try:
         row, outcome = run_fit(problem, fits.start, number, problems.AMONG_CLUTTER, folder, console)
     except InputError as error:
@@ -139,6 +141,20 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     problem = replace(problem, notes={**problem.notes, "clutter": summary})
     fits = replace(fits, problem=problem, rows=rows)
     return replace(fits, best=row, found=among) if kept else fits
+
+
+def _fit_permittivities(fits: Fits, folder: RunFolder, console: Console) -> Fits:
+    """Make the best fit again with free permittivities if the data contradict it or these."""
+    if not discovery.needs_permittivities(fits.found):
+        return fits
+    given = fits.problem, fits.start, fits.best["start"], problems.WITH_PERMITTIVITIES
+    try:
+        row, outcome = run_fit(*given, folder, console)
+    except InputError:  # the data do not determine permittivities
+        return fits
+    rows, bright = {**fits.rows, problems.WITH_PERMITTIVITIES: [row]}, outcome()
+    kept = {} if discovery.needs_clutter(bright) else {"best": row, "found": bright}
+    return replace(fits, rows=rows, **kept)
 
 
 def run_fit(
@@ -247,6 +263,9 @@ def _fit_or_search(
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
         how["callbacks"] = callbacks(checkpoint)
         return inversion.reconstruct(start.scene, sharp, unknowns, **how), {}
+    if method == problems.WITH_PERMITTIVITIES:
+        how["callbacks"] = callbacks(checkpoint)
+        return discovery.reconstruct_with_permittivities(*given, **how), {}
     if method == problems.AMONG_CLUTTER:
         # Every frame has clutter of its own.
         how["schedule"] = [replace(stage, frames_per_step=None) for stage in stages]

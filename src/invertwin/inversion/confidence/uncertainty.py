@@ -17,7 +17,7 @@ from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.gauss_newton import penalty_curvature
 from invertwin.inversion.loss import CURVED
 from invertwin.runtime.progress import track
-from invertwin.scene.parameters import Coordinate, Entries, Scale
+from invertwin.scene.parameters import Coordinate, Entries, MaterialValues, Scale
 
 _MAX_COORDINATES = 64  # each coordinate costs derivatives of the map
 # Relative to the apparent information due to noise of the derivatives.
@@ -30,14 +30,16 @@ _PROFILE_DISTANCE = 2.0  # spans: displacement of a profiled direction
 _PROFILE_REFITS = 3  # Gauss–Newton steps of the other coordinates
 _MIN_LOSS_RISE = 1e-3  # lower limit of the rise of the loss, relative to the quadratic model
 _SIZE_DEVIATION = 0.1  # of the sizes of objects whose pose alone is fitted, before the data
+_BRIGHTNESS_DEVIATION = 0.7  # of ln(permittivity - 1), before the data: about 3 dB
+_CONTRADICTED = 2.0  # standard deviations of a held value from the one that the data determine
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Error bars of a fit.
 
-    They state the effect of speckle and noise on the estimate near its minimum, and of the error of
-    sizes that the fit holds (``size_errors``). The verdict assesses wrong minima, models and
+    They state the effect of speckle and noise on the estimate near its minimum, and of errors of
+    sizes and permittivities that the fit holds. The verdict assesses wrong minima, models and
     starts. A direction that is known to a quarter of its span at best has the error bar of the loss
     profile two spans away, if the profile rises less than the curvature at the minimum predicts.
 
@@ -52,6 +54,8 @@ class Uncertainty:
         source: ``looks`` (realisations of the twin) or ``frames`` of the data.
         size_errors: root mean square error of the size of every object whose pose alone is fitted,
             relative, given the data and a deviation of a tenth before them.
+        contradicted: held sizes and permittivities, such as "letter.permittivity", that the data
+            contradict by more than two standard deviations.
         newton_step: distance of every coordinate from the minimum of the loss, in its unit; empty
             if unknown. It is part of the covariance.
     """
@@ -63,6 +67,7 @@ class Uncertainty:
     count: int
     source: Literal["looks", "frames"]
     size_errors: Mapping[str, float] = field(default_factory=dict)
+    contradicted: tuple[str, ...] = ()
     newton_step: tuple[float, ...] = ()
 
     @property
@@ -106,8 +111,9 @@ class CovarianceEstimator:
     samples, to remove the apparent information of their noise. For models without realisations,
     Cov(g) is the scatter over frames of the data, assuming independent speckle in each frame.
 
-    An object whose pose alone is fitted has a size n of deviation σ = 0.1. The gradient of the loss
-    by n, at coordinates that follow, is a linear measurement of it. By the mean square of n given
+    An object whose pose alone is fitted has a size n of deviation σ = 0.1, and a permittivity n,
+    which determines its brightness, of deviation 0.7 (ε − 1). The gradient of the loss with respect
+    to n, at coordinates that follow, is a linear measurement of it. By the mean square of n given
     this measurement the coordinates are displaced, ``H_θθ⁻¹ H_θn n`` (consider parameters). So they
     are by the Newton step, ``−H⁻¹ g``, from the estimate to the minimum.
 
@@ -118,8 +124,8 @@ class CovarianceEstimator:
 
     Args:
         result: result of the fit.
-        is_fitted: whether the estimate comes from a fit: sizes that it holds are uncertain, and it
-            may have stopped before the minimum (told without regularisers only).
+        is_fitted: whether the estimate comes from a fit: sizes and permittivities that it holds are
+            uncertain, and it may have stopped before the minimum (without regularisers only).
 
     Raises:
         InputError: More than 64 coordinates, or a loss without a curvature.
@@ -128,8 +134,8 @@ class CovarianceEstimator:
     def __init__(self, result: FitResult, *, is_fitted: bool = False) -> None:
         with torch.enable_grad():
             self._may_move = is_fitted and not result.fit.penalty().requires_grad
-        self._sizes = _find_held_sizes(result.fit) if is_fitted else []
-        fit = result.fit.copy(*map(Scale, self._sizes))
+        held = list(_find_held_values(result.fit)) if is_fitted else []
+        fit = result.fit.copy(*(module for module, _ in held))
         found = list(iterate_coordinates(fit.modules))
         others = [x for x in fit.objective.losses if not isinstance(x, CURVED)]
         if len(found) > _MAX_COORDINATES or others:
@@ -143,9 +149,13 @@ class CovarianceEstimator:
         # Coordinates without effect are dropped, unless they have a span.
         moves = [any(bool(part[k].any()) for part in rows[0]) for k in range(len(found))]
         kept = [k for k, c in enumerate(found) if moves[k] or math.isfinite(c.span)]
-        self._rows = [[part[kept] for part in side] for side in rows]
-        self._kept = kept[: len(kept) - len(self._sizes)]
+        own = len(found) - len(held)
+        self._kept = [k for k in kept if k < own]
         self._found = [found[k] for k in self._kept]
+        self._held = [found[k] for k in kept if k >= own]
+        scale = torch.ones(len(found)).double()
+        scale[own:] = torch.tensor([deviation for _, deviation in held])
+        self._rows = [[_scale_rows(part, scale)[kept] for part in side] for side in rows]
 
     def error_bars(
         self, frames: Sequence[int] | None = None, realisations: Sequence[Any] = ()
@@ -159,7 +169,7 @@ class CovarianceEstimator:
         Raises:
             InputError: A single frame of a model without realisations.
         """
-        end, found, rows, sizes = self._end, self._found, self._rows, self._sizes
+        end, found, rows, held = self._end, self._found, self._rows, self._held
         if frames is not None:
             end = end.select_frames(frames, realisations)
             rows = [[part[:, frames] for part in side] for side in rows]
@@ -194,15 +204,22 @@ class CovarianceEstimator:
             step = -(inverse * square) @ _project([slopes], rows[0])[0, own]
             moved = bars.covariance + torch.outer(step, step)
             bars = replace(bars, covariance=moved, newton_step=tuple(step.abs().tolist()))
-        if not sizes:
+        if not held:
             return bars
         shift = (inverse * square) @ curvature[own, len(found) :]
-        follow = torch.cat([-shift, torch.eye(len(sizes))]).T.double()
+        follow = torch.cat([-shift, torch.eye(len(held))]).T.double()
         slope, noise = (follow @ part @ follow.T for part in (curvature, scatter))
-        square = _held_mean_square(slope, noise, -follow @ _project([slopes], rows[0])[0])
-        errors = dict(zip(sizes, square.diagonal().sqrt().tolist(), strict=True))
-        covariance = bars.covariance + shift @ square @ shift.T
-        return replace(bars, covariance=covariance, size_errors=errors)
+        mean, variance = _held_posterior(slope, noise, -follow @ _project([slopes], rows[0])[0])
+        square = variance + torch.outer(mean, mean)
+        names = [coordinate.name for coordinate in held]
+        errors = zip(names, (_SIZE_DEVIATION * square.diagonal().sqrt()).tolist(), strict=True)
+        far = (mean.abs() > _CONTRADICTED * variance.diagonal().sqrt()).tolist()
+        return replace(
+            bars,
+            covariance=bars.covariance + shift @ square @ shift.T,
+            size_errors={n.removesuffix(".scale"): e for n, e in errors if n.endswith(".scale")},
+            contradicted=tuple(name for name, is_far in zip(names, far, strict=True) if is_far),
+        )
 
     def _widen_covariance(self, covariance: Tensor, spans: Tensor) -> Tensor:
         """Widen weak directions of the covariance (in spans) by profiles of the loss."""
@@ -328,20 +345,49 @@ def _mean_derivatives(fit: Fit, coordinates: Sequence[Coordinate]) -> list[list[
     return [[(a + b) / 2 for a, b in pairs], [(a - b) / 2 for a, b in pairs]]
 
 
-def _find_held_sizes(fit: Fit) -> list[str]:
-    """Return the names of meshes of which a fit moves the pose, but not the shape."""
+def find_known_permittivities(fit: Fit) -> dict[str, float]:
+    """Return the permittivities that a fit holds of objects that it moves.
+
+    There is none if all objects move: only others determine the gain of the data, and with it how
+    bright an object is.
+
+    Args:
+        fit: fit with its scene and its unknowns.
+    """
+    with torch.enable_grad():
+        objects = fit.apply_modules()[0].objects
+    moved = {name: item for name, item in objects.items() if item.vertices.requires_grad}
+    found = {name: vars(item.material).get("permittivity") for name, item in moved.items()}
+    known = {n: value for n, value in found.items() if isinstance(value, float) and value > 1}
+    return known if len(moved) < len(objects) else {}
+
+
+def _find_held_values(fit: Fit) -> Iterator[tuple[nn.Module, float]]:
+    """Yield sizes and permittivities that a fit of a pose holds, with their deviations."""
     with torch.enable_grad():
         objects = fit.apply_modules()[0].objects
     meshes = {name: item for name, item in objects.items() if item.cloud is None}
     moved = {name: item.mesh for name, item in meshes.items() if item.transform.requires_grad}
-    return [name for name, mesh in moved.items() if not mesh.vertices.requires_grad]
+    held = [name for name, mesh in moved.items() if not mesh.vertices.requires_grad]
+    for name in held:
+        yield Scale(name), _SIZE_DEVIATION
+    for name, value in find_known_permittivities(fit).items():
+        if name in held:
+            deviation = _BRIGHTNESS_DEVIATION * (value - 1)
+            yield MaterialValues(name, permittivity=value), deviation
 
 
-def _held_mean_square(slope: Tensor, noise: Tensor, score: Tensor) -> Tensor:
-    """Return the mean square of held sizes, given minus a gradient: slope · sizes, and noise."""
-    before = _SIZE_DEVIATION**2 * torch.eye(len(slope), dtype=torch.float64)
-    gain = before @ slope.T @ torch.linalg.pinv(slope @ before @ slope.T + noise, hermitian=True)
-    return before - gain @ slope @ before + torch.outer(gain @ score, gain @ score)
+def _held_posterior(slope: Tensor, noise: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and covariance of held values, of unit deviation before the data, given minus a
+    gradient: slope · values, and noise.
+    """
+    gain = slope.T @ torch.linalg.pinv(slope @ slope.T + noise, hermitian=True)
+    return gain @ score, torch.eye(len(slope), dtype=torch.float64) - gain @ slope
+
+
+def _scale_rows(rows: Tensor, factors: Tensor) -> Tensor:
+    """Multiply each derivative of a map by a factor of its coordinate."""
+    return rows * factors.to(rows).reshape(-1, *[1] * (rows.dim() - 1))
 
 
 def _project(loss_gradients: Sequence[Sequence[Tensor]], rows: Sequence[Tensor]) -> Tensor:
