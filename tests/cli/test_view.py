@@ -103,7 +103,9 @@ def test_a_folder_says_what_was_found_and_its_verdict(run_file):
 def test_what_moves_has_steps_in_time(run_file):
     text = RUN.replace("[radar]\n", WALKS + "\n[radar]\n", 1)
     Path("walk.toml").write_text(text)
-    steps = load_display(Path("walk.toml"))[0].steps
+    display = load_display(Path("walk.toml"))[0]
+    steps = display.steps
+    assert display.shows_start  # as its data do
     assert [step.label for step in steps[:2]] == ["time 0.00 s", "time 0.05 s"]
     middles = [step.bodies["plate"].vertices.mean(0) for step in (steps[0], steps[40])]
     assert steps[-1].label == "time 2.00 s"  # where its trajectory ends

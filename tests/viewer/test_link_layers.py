@@ -54,11 +54,11 @@ def test_cells_are_in_the_band_of_their_level():
     found = layers_of(floor(PerfectConductor()), RadioMap(plane, SETTINGS), levels)
     bands = {n.removeprefix("levels/"): x for n, x in found.items() if x.group == "levels"}
     assert len(bands) == 12
-    assert list(bands)[-1].endswith(" to 31")  # the highest
+    assert list(bands)[-1].endswith(" to 31 dBm")  # the highest
     assert sum(len(layer.points) for layer in bands.values()) == 4 * 31
     centres = plane.centres.reshape(-1, 3).numpy()
     for name, layer in bands.items():
-        low, high = (float(word) for word in name.split(" to "))
+        low, high = (float(word) for word in name.removesuffix(" dBm").split(" to "))
         middles = layer.points.reshape(-1, 4, 3).mean(1)
         away = np.linalg.norm(middles[:, None] - centres[None], axis=2)
         assert away.min(1).max() < 1e-6
@@ -82,9 +82,9 @@ def test_cells_of_a_metasurface_have_the_colour_of_their_phase(spacing, drawn):
     bands = {n.split("/")[1]: x for n, x in found.items() if x.group.startswith("metasurface")}
     counts = {name: len(layer.faces) // 2 for name, layer in bands.items()}
     # 3.3 rad are -171 degrees, as -3.0 rad are -172.
-    assert counts == {"-180 to -150": 2, "-90 to -60": 2, "0 to 30": 3, "150 to 180": 1}
+    assert counts == {"-180 to -150 °": 2, "-90 to -60 °": 2, "0 to 30 °": 3, "150 to 180 °": 1}
     assert len({layer.color for layer in bands.values()}) == 4
-    (single,) = (layer for name, layer in bands.items() if name == "150 to 180")
+    (single,) = (layer for name, layer in bands.items() if name == "150 to 180 °")
     # Of the second row of four along y, which is -x in the world; the lower one of two.
     middle = np.array([0.5 * drawn, -2.0, 1.0 - 0.5 * drawn])
     assert single.points.mean(0) == pytest.approx(middle, abs=1e-6)

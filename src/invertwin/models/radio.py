@@ -147,6 +147,11 @@ class RadioMap(ForwardModel):
         checked_number(self.floor_db, "floor [dB]", -math.inf)
         checked_number(self.noise_dbm, "noise [dBm]", -math.inf)
 
+    @property
+    def unit(self) -> str:
+        """Unit of the quantity."""
+        return {"received_power": "dBm", "delay_spread": "s", "gain": "1"}.get(self.quantity, "dB")
+
     def link_statistics(self, scene: Scene, sensor: Transmitters, seed: int) -> LinkStatistics:
         """Gain and delay spread in linear units.
 

@@ -137,6 +137,7 @@ class Display:
         up: The direction that points up.
         ahead: The direction in which the radar looks.
         answer: What a run found, in a sentence.
+        shows_start: True if the first step is shown first, as of motions in time, not the last.
     """
 
     __pydantic_config__ = ConfigDict(
@@ -150,6 +151,7 @@ class Display:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
     answer: str = ""
+    shows_start: bool = False
 
     @property
     def box(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -49,7 +49,7 @@ def link_layers(
         with suppress(InputError):  # of scenes without such paths
             layers += _draw_paths(scene, sensor, model.places.positions, model.propagation)
     if isinstance(model.places, MapPlane) and levels is not None:
-        layers += _draw_levels(model.places, levels)
+        layers += _draw_levels(model.places, levels, model.unit)
     return layers
 
 
@@ -78,13 +78,13 @@ def _draw_paths(
     return layers
 
 
-def _draw_levels(plane: MapPlane, levels: NDArray[np.float64]) -> list[DisplayLayer]:
+def _draw_levels(plane: MapPlane, levels: NDArray[np.float64], unit: str) -> list[DisplayLayer]:
     """Cells of a plane in bands of as many cells."""
     sides = torch.stack([plane.first, plane.second]) / torch.tensor(plane.count)[:, None]
     corners, known = plane.centres.reshape(-1, 1, 3) + _CORNERS @ sides, np.isfinite(levels.ravel())
     values = levels.ravel()[known]
     edges = np.quantile(values, np.linspace(0, 1, _BANDS + 1)) if len(values) else values
-    return _draw_bands(LEVELS, to_float32(corners)[known], values, edges)
+    return _draw_bands(LEVELS, to_float32(corners)[known], values, edges, unit)
 
 
 def _draw_cells(panel: Metasurface, sensor: Transmitters) -> list[DisplayLayer]:
@@ -94,11 +94,12 @@ def _draw_cells(panel: Metasurface, sensor: Transmitters) -> list[DisplayLayer]:
     offsets = panel.cells.offsets[:, None] + _CELL_SHARE * panel.spacing * _CORNERS
     corners = panel.position + scale * offsets @ panel.axes[:, 1:].T
     phases = np.rad2deg(panel.response.detach().angle().numpy())
-    return _draw_bands(PHASES, to_float32(corners), phases, np.linspace(-180, 180, _BANDS + 1))
+    edges = np.linspace(-180, 180, _BANDS + 1)
+    return _draw_bands(PHASES, to_float32(corners), phases, edges, "°")
 
 
 def _draw_bands(
-    group: str, corners: NDArray[Any], values: NDArray[Any], edges: NDArray[Any]
+    group: str, corners: NDArray[Any], values: NDArray[Any], edges: NDArray[Any], unit: str
 ) -> list[DisplayLayer]:
     """Cells [cell, 4, 3] by bands of values, the lowest first, which a slider hides."""
     from matplotlib import colormaps
@@ -110,7 +111,7 @@ def _draw_bands(
         faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(own))[:, None, None]
         red, green, blue, _ = colormaps[colormap]((band + 0.5) / _BANDS, bytes=True)
         look = (int(red), int(green), int(blue)), opacity
-        name = f"{group}/{edges[band]:.4g} to {edges[band + 1]:.4g}"
+        name = f"{group}/{edges[band]:.4g} to {edges[band + 1]:.4g} {unit}"
         triangles = faces.reshape(-1, 3).astype(np.int32)
         layers.append(DisplayLayer(name, "surface", own.reshape(-1, 3), triangles, *look))
     return layers

@@ -377,7 +377,8 @@
 
   if (steps.length > 1) {
     slider.parentElement.hidden = false;
-    slider.max = slider.value = steps.length - 1;
+    slider.max = steps.length - 1;
+    slider.value = data.initial_step;
     slider.addEventListener("input", show);
     show();
   }

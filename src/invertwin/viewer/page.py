@@ -186,6 +186,7 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
             for layer in display.layers
         ],
         "steps": [pack_step(step) for step in kept],
+        "initial_step": 0 if display.shows_start else len(kept) - 1,
         "sensors": [_sensor_data(name, own) for name, own in maps.items()],
         "position": [
             {"name": name, "color": color, "size": size, "shown": name != SAMPLED_PATHS}

@@ -84,7 +84,8 @@ class Viewer:
         self._display = display
         self._lock, self._due, self._closed = threading.Lock(), threading.Event(), False
         self._sensors = list(dict.fromkeys([*display.maps, *self._links]))
-        self._wish = _ViewerState(step=len(self._steps) - 1, sensor=next(iter(self._sensors), ""))
+        begun = 0 if display.shows_start else len(self._steps) - 1
+        self._wish = _ViewerState(step=begun, sensor=next(iter(self._sensors), ""))
         # What sensors see at steps as they come.
         self._found: dict[int, Mapping[str, DisplayMaps]] = {}
         self._taken: int | None = None  # the step whose bodies the link has
@@ -161,7 +162,9 @@ class Viewer:
             gui.add_text("found", display.answer, multiline=True, disabled=True)
         last, several = len(self._steps) - 1, len(self._steps) > 1
         self._where = gui.add_text("state", "", disabled=True, visible=several)
-        self._step = gui.add_slider("step", 0, max(1, last), 1, max(0, last), visible=several)
+        self._step = gui.add_slider(
+            "step", 0, max(1, last), 1, max(0, self._wish.step), visible=several
+        )
         self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
         self._play = gui.add_checkbox("play", False, visible=several)
         self._play.on_update(lambda _: self._due.set())
@@ -191,13 +194,14 @@ class Viewer:
         bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS]
         if len(bands) < 2:
             return
-        lows = [name.split("/")[1].split()[0] for name in bands]
-        marks = (0, lows[0]), (len(bands) - 1, lows[-1])  # more would overlap
-        slider = self._server.gui.add_slider("lowest level", 0, marks[1][0], 1, 0, marks=marks)
+        tops = {name: float(name.split(" to ")[1].split()[0]) for name in bands}
+        low, high, unit = tops[bands[0]], tops[bands[-1]], bands[0].split()[-1]
+        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-12) / 20))
+        ends = step * (math.floor(low / step) - 1), step * (math.ceil(high / step) - 1)
+        slider = self._server.gui.add_slider(f"lowest level [{unit}]", *ends, step, ends[0])
 
         def hide_lower(_: Any) -> None:
-            slider.label = f"lowest level: {lows[int(slider.value)]}"
-            self._hidden = set(bands[: int(slider.value)])
+            self._hidden = {name for name, top in tops.items() if top <= slider.value}
             self._set_visibility(layers.LEVELS, self._visible[layers.LEVELS])
 
         slider.on_update(hide_lower)

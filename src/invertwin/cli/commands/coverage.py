@@ -16,8 +16,6 @@ from invertwin.errors import InputError
 from invertwin.links import MapPlane, ReceiverPoints
 from invertwin.storage.run_folder import RunFolder
 
-_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB", "delay_spread": "s"}
-
 
 def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], str]:
     """Compute the map of a run file, write the folder, return tables and a sentence to print."""
@@ -25,7 +23,7 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     model = radio_map(run, None)
     with prefix_errors("transmitter"):
         sensor = require_section(run, "transmitter", "a coverage map").build()
-    places, unit = model.places, _UNITS.get(model.quantity, "1")
+    places, unit = model.places, model.unit
     if not isinstance(places, MapPlane | ReceiverPoints):
         raise InputError("map.places: expected points or a plane, got a mesh; choose one of these")
     with torch.no_grad():

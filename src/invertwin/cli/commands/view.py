@@ -91,7 +91,9 @@ def _display_of_run(
             if grid is not None
         }
         display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
-        display = replace(display, steps=[] if is_fit else _steps_in_time(run, own))
+        display = replace(
+            display, steps=[] if is_fit else _steps_in_time(run, own), shows_start=True
+        )
         antennas = [] if is_fit and run.placement else _build_link_layers(run, own, folder)
     if folder is not None and is_fit:
         display = viewer.Display.load(folder / VIEW_FILE)
