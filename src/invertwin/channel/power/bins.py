@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from invertwin.channel.paths import Grid, Link, Paths
 from invertwin.channel.rays.arrays import to_float, to_index, to_torch, view_as_torch
-from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
+from invertwin.channel.rays.backend import Mask, backend, dr, mi, mit, tracing
 
 # Most bytes of copies of a map, one per thread; larger maps use atomic additions.
 _MAX_COPY_BYTES = 2**28
@@ -230,7 +230,7 @@ class BinAccumulator:
         copied = backend() == "cpu" and 4 * size * dr.thread_count() <= _MAX_COPY_BYTES
         self._mode = dr.ReduceMode.Expand if copied else dr.ReduceMode.Auto
 
-    def add(self, path: PathContribution, active: mit.Bool | bool) -> None:
+    def add(self, path: PathContribution, active: Mask) -> None:
         """Add paths.
 
         Args:
@@ -241,9 +241,7 @@ class BinAccumulator:
             power = path.power * strip.transverse_weight
             self._scatter_strip([power * weight for weight in strip.weights], strip, active)
 
-    def add_tangent(
-        self, path: PathContribution, tangents: FourFloats, active: mit.Bool | bool
-    ) -> None:
+    def add_tangent(self, path: PathContribution, tangents: FourFloats, active: Mask) -> None:
         """Add the tangent of the deposit of paths.
 
         Args:
@@ -261,9 +259,7 @@ class BinAccumulator:
                 values = [v + power * tangent * s for v, s in zip(values, slopes, strict=True)]
             self._scatter_strip(values, strip, active)
 
-    def _scatter_strip(
-        self, values: list[mit.Float], strip: _Strip, active: mit.Bool | bool
-    ) -> None:
+    def _scatter_strip(self, values: list[mit.Float], strip: _Strip, active: Mask) -> None:
         amounts = mi.Vector4f(*values, 0.0)
         lane = dr.arange(mi.UInt32, dr.width(amounts, strip.index))
         index = strip.index + lane % self._copies * self._strip_count
@@ -275,7 +271,7 @@ class BinAccumulator:
 
 
 def gather_adjoint(
-    strip_gradient: mit.Float, layout: BinLayout, path: PathContribution, active: mit.Bool | bool
+    strip_gradient: mit.Float, layout: BinLayout, path: PathContribution, active: Mask
 ) -> FourFloats:
     """Adjoint of the deposit: gather ∂loss/∂(power, range, u, v) of every path.
 

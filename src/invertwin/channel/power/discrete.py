@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from invertwin.channel.rays.arrays import uniform_pair
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
 
 # Probability of an edge above which float32 resolves the position of a sample within it.
@@ -48,7 +48,7 @@ def balance_by_object(
     rays: RayScene,
     edge: mit.UInt32,
     weight: mit.Float,
-    receiver: mit.Bool | bool,
+    receiver: Mask,
     antenna_count: int,
 ) -> mit.Float:
     """Balance the weights of edges between objects.

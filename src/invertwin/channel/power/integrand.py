@@ -14,7 +14,7 @@ from torch import Tensor
 from invertwin.channel.paths import GainPattern
 from invertwin.channel.power.surface import SCATTERING_TABLES, ScatteringLawTables
 from invertwin.channel.rays import arrays, surface_point
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.ray_scene import RayScene
 from invertwin.channel.rays.surface_point import SurfacePoint, Triangle, interpolate_position
 
@@ -123,7 +123,7 @@ class Inputs:
         return mi.Float(odd) if odd == even else dr.select((bounces & 1) == 1, odd, even)
 
     def antenna_position(
-        self, frame: mit.UInt32, receiver: mit.Bool | bool, active: mit.Bool | bool = True
+        self, frame: mit.UInt32, receiver: Mask, active: Mask = True
     ) -> mit.Point3f:
         """Look up the position of the receiver or the transmitter, about the local origin [m].
 
@@ -138,9 +138,7 @@ class Inputs:
         rx, tx = (self.antenna_position(frame, end, active) for end in (True, False))
         return dr.select(receiver, rx, tx)
 
-    def gain(
-        self, frame: mit.UInt32, receiver: mit.Bool | bool, direction: mit.Vector3f
-    ) -> mit.Float:
+    def gain(self, frame: mit.UInt32, receiver: Mask, direction: mit.Vector3f) -> mit.Float:
         """Evaluate the linear power gain of the receiver or the transmitter.
 
         Args:
@@ -197,7 +195,7 @@ class PatternTable:
         return rows_of_gain[0] + (rows_of_gain[1] - rows_of_gain[0]) * along
 
 
-def corners(inputs: Inputs, face: mit.UInt32, active: mit.Bool | bool = True) -> Triangle:
+def corners(inputs: Inputs, face: mit.UInt32, active: Mask = True) -> Triangle:
     """Gather the corners of triangles, attached.
 
     Args:
@@ -233,7 +231,7 @@ class SurfaceInteraction:
 
 
 def compute_interaction(
-    inputs: Inputs, point: SurfacePoint, active: mit.Bool | bool = True
+    inputs: Inputs, point: SurfacePoint, active: Mask = True
 ) -> SurfaceInteraction:
     """Locate surface points.
 
@@ -317,9 +315,7 @@ def to_radar_frame(inputs: Inputs, frame: mit.UInt32, direction: mit.Vector3f) -
     return project_to_axes(radar_axes(inputs, frame), direction)
 
 
-def radar_axes(
-    inputs: Inputs, frame: mit.UInt32, active: mit.Bool | bool = True
-) -> list[mit.Vector3f]:
+def radar_axes(inputs: Inputs, frame: mit.UInt32, active: Mask = True) -> list[mit.Vector3f]:
     """Gather the rows of the radar's rotation, whose columns are the radar's axes.
 
     Args:
@@ -396,7 +392,7 @@ class AntennaPose:
 
     @staticmethod
     def look_up(
-        inputs: Inputs, frame: mit.UInt32, receiver: mit.Bool | bool, active: mit.Bool | bool = True
+        inputs: Inputs, frame: mit.UInt32, receiver: Mask, active: Mask = True
     ) -> AntennaPose:
         """Gather the pose; a loop need not do so if it is gathered before.
 
@@ -430,8 +426,8 @@ def connect_antenna(
     frame: mit.UInt32,
     point: SurfaceInteraction,
     incident: mit.Vector3f,
-    receiver: mit.Bool | bool = True,
-    active: mit.Bool | bool = True,
+    receiver: Mask = True,
+    active: Mask = True,
     *,
     antenna: AntennaPose,
     is_same_antenna: bool = False,

@@ -24,7 +24,7 @@ from invertwin.channel.power.transmission import (
     trace_transmission,
 )
 from invertwin.channel.rays import arrays
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.intersections import IntersectionCurves
 from invertwin.channel.rays.ray_scene import RAY_EPSILON
 from invertwin.channel.rays.surface_point import SurfacePoint, barycentric_coordinates
@@ -178,7 +178,7 @@ class IntersectionCurveSampler:
         return found
 
 
-def decode_subpath(index: mit.UInt32, depth: int) -> tuple[mit.UInt32, mit.Bool | bool]:
+def decode_subpath(index: mit.UInt32, depth: int) -> tuple[mit.UInt32, Mask]:
     """Decode the subpath before the curve from the number of a sample.
 
     Args:

@@ -19,7 +19,7 @@ from invertwin.channel.power.direction_sampling import DirectionSampler
 from invertwin.channel.power.integrand import Inputs, SurfaceInteraction
 from invertwin.channel.power.transmission import SegmentTransmission, trace_transmission
 from invertwin.channel.rays.arrays import opaque, scramble_seed, uniform_pair
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.ray_scene import RAY_EPSILON
 from invertwin.channel.rays.surface_point import SurfacePoint
 
@@ -72,7 +72,7 @@ class PathState(TypedDict):
     interaction: SurfaceInteraction
     weight: mit.Float
     previous_vertices: mit.UInt32
-    to_receiver: mit.Bool | bool
+    to_receiver: Mask
     u: mit.Float
     v: mit.Float
     power: mit.Float
@@ -201,9 +201,7 @@ class RandomWalk:
         self._extend(state, point or self._compute_interaction(state), self.direction_sampler)
         return state
 
-    def trace_subpath(
-        self, first: PathState, count: mit.UInt32, receiver: mit.Bool | bool
-    ) -> PathState:
+    def trace_subpath(self, first: PathState, count: mit.UInt32, receiver: Mask) -> PathState:
         """Trace the one path of a given number of vertices that ends at an antenna.
 
         Args:
@@ -289,7 +287,7 @@ def connect_path(
     inputs: Inputs,
     state: PathState,
     point: SurfaceInteraction,
-    receiver: mit.Bool | bool,
+    receiver: Mask,
     *,
     min_vertices: mit.UInt32 | int = 1,
     shared_visibility: bool = False,
@@ -403,7 +401,7 @@ class PathRecords:
         rows, length = dr.empty(mi.Float, 4 * lanes * depth), dr.empty(mi.Float, lanes * depth)
         return PathRecords(lanes, depth, state["frame"], dr.zeros(mi.UInt32, lanes), rows, length)
 
-    def read_vertex(self, number: mit.UInt32, active: mit.Bool | bool = True) -> PathVertex:
+    def read_vertex(self, number: mit.UInt32, active: Mask = True) -> PathVertex:
         """Read one vertex of every path.
 
         Args:

@@ -20,7 +20,7 @@ from invertwin.channel.power.mesh_folds import is_hidden_by_fold
 from invertwin.channel.power.transmission import SegmentHit, SegmentTransmission
 from invertwin.channel.rays import surface_point
 from invertwin.channel.rays.arrays import gather_points, scramble_seed
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.intersections import PLANE_TOLERANCE
 from invertwin.channel.rays.ray_scene import RAY_EPSILON, RayScene
 
@@ -63,7 +63,7 @@ class SilhouetteSample:
     """
 
     index: mit.UInt32
-    is_receiver: mit.Bool | bool
+    is_receiver: Mask
     frame: mit.UInt32
     first_vertex: mit.UInt32
     second_vertex: mit.UInt32
@@ -173,9 +173,7 @@ class SilhouetteSampler:
             )
         self.seed, self.transmission_seed = scramble_seed(seed, 3), scramble_seed(seed, 9)
 
-    def _decode_entry(
-        self, entry: mit.UInt32
-    ) -> tuple[mit.UInt32, mit.UInt32, mit.Bool | bool, mit.Point3f]:
+    def _decode_entry(self, entry: mit.UInt32) -> tuple[mit.UInt32, mit.UInt32, Mask, mit.Point3f]:
         """Decode an entry: edge, frame, True for the receiver of two antennas, and position."""
         rays, edges = self.rays, len(self.rays.topology.edges)
         pose, edge = entry // edges, entry % edges

@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_float
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.scene import ScatteringLaw
 
@@ -64,7 +64,7 @@ class ScatteringLawTables:
         count = rows.amplitude.shape[1]
         return ScatteringLawTables(tables, constants=known, cosine_count=count, **has)
 
-    def value(self, name: str, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
+    def value(self, name: str, row: mit.UInt32, active: Mask = True) -> mit.Float:
         """Look up a number of each row: ``diffuse``, ``index`` or ``attenuation``.
 
         Args:
@@ -75,7 +75,7 @@ class ScatteringLawTables:
         return self._column(name, 0, 1, row, active)
 
     def _column(
-        self, name: str, number: int, count: int, row: mit.UInt32, active: mit.Bool | bool
+        self, name: str, number: int, count: int, row: mit.UInt32, active: Mask
     ) -> mit.Float:
         """Look up one of the ``count`` numbers of a table for every row."""
         if self._is_constant(name):
@@ -85,13 +85,13 @@ class ScatteringLawTables:
     def _is_constant(self, name: str) -> bool:
         return name in self.constants and not dr.grad_enabled(self.tables[name])
 
-    def _read(self, name: str, index: mit.UInt32, active: mit.Bool | bool) -> mit.Float:
+    def _read(self, name: str, index: mit.UInt32, active: Mask) -> mit.Float:
         """Gather entries of a table; by all lanes if it has no derivatives, to gather it once."""
         table = self.tables[name]
         return dr.gather(mi.Float, table, index, active if dr.grad_enabled(table) else True)
 
     def interpolate_cosine(
-        self, name: str, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
+        self, name: str, row: mit.UInt32, cosine: mit.Float, active: Mask = True
     ) -> mit.Float:
         """Interpolate a table over cosθ linearly.
 
@@ -110,7 +110,7 @@ class ScatteringLawTables:
         return first + (second - first) * (t - mi.Float(low))
 
     def sheet_transmission(
-        self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool = True
+        self, row: mit.UInt32, cosine: mit.Float, active: Mask = True
     ) -> tuple[mit.Float, mit.Float]:
         """Interpolate the transmittance of a sheet and its extra length [m].
 
@@ -131,7 +131,7 @@ class ScatteringLawTables:
         normal: mit.Vector3f,
         incident: mit.Vector3f,
         outgoing: mit.Vector3f,
-        active: mit.Bool | bool = True,
+        active: Mask = True,
     ) -> tuple[mit.Float, mit.Float]:
         """Evaluate ``((1 + cosψ)/2)^p`` of one lobe; return it and its exponent p.
 
@@ -151,7 +151,7 @@ class ScatteringLawTables:
         exponent = self.exponent(number, row, active)
         return dr.exp(exponent * log_one_minus(0.25 * apart)), exponent
 
-    def exponent(self, number: int, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
+    def exponent(self, number: int, row: mit.UInt32, active: Mask = True) -> mit.Float:
         """Look up the exponent of a lobe.
 
         Args:
@@ -167,7 +167,7 @@ class ScatteringLawTables:
         normal: mit.Vector3f,
         incident: mit.Vector3f,
         outgoing: mit.Vector3f | None,
-        active: mit.Bool | bool = True,
+        active: Mask = True,
     ) -> mit.Float:
         """Evaluate ``f |cosθ| |cosθ'|`` between unit directions that point away from the surface.
 
@@ -204,7 +204,7 @@ class ScatteringLawTables:
             value = dr.select(dr.detach(product) < 0, through, value)
         return value
 
-    def _amplitude(self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool) -> mit.Float:
+    def _amplitude(self, row: mit.UInt32, cosine: mit.Float, active: Mask) -> mit.Float:
         """Look up the root of the reflectance; inside a body, at the refracted angle."""
         if not self.has_refracting_bodies:
             return self.interpolate_cosine("amplitude", row, dr.abs(cosine), active)
@@ -212,7 +212,7 @@ class ScatteringLawTables:
         return dr.select(total, 1.0, self.interpolate_cosine("amplitude", row, outer, active))
 
     def _outer_cosine(
-        self, row: mit.UInt32, cosine: mit.Float, active: mit.Bool | bool
+        self, row: mit.UInt32, cosine: mit.Float, active: Mask
     ) -> tuple[mit.Float, mit.Bool]:
         """Compute the cosine outside an interface (Snell), and the mask of total reflections."""
         inside = dr.detach(cosine) < 0
@@ -226,7 +226,7 @@ class ScatteringLawTables:
         normal: mit.Vector3f,
         incident: mit.Vector3f,
         outgoing: mit.Vector3f,
-        active: mit.Bool | bool,
+        active: Mask,
     ) -> mit.Float:
         """Evaluate ``f |cosθ| |cosθ'|`` through the interface of a body.
 
@@ -256,7 +256,7 @@ class ScatteringLawTables:
         lobe = gaussian(mismatch, variance)
         return roots[0] * roots[1] * dr.square(index) * lobe * dr.abs(first * second)
 
-    def refraction_variance(self, row: mit.UInt32, active: mit.Bool | bool = True) -> mit.Float:
+    def refraction_variance(self, row: mit.UInt32, active: Mask = True) -> mit.Float:
         """Compute the variance of the refracted direction's tangential part.
 
         It is that of the specular lobe.

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.rays.backend import backend, dr, mi, mit
+from invertwin.channel.rays.backend import Mask, backend, dr, mi, mit
 from invertwin.checks import strip_derivatives
 
 
@@ -62,9 +62,7 @@ def to_vectors(kind: Any, values: Tensor) -> Any:
     return kind(*(to_float(column) for column in values.T))
 
 
-def gather_points(
-    table: mit.Float, index: mit.UInt32, active: mit.Bool | bool = True
-) -> mit.Point3f:
+def gather_points(table: mit.Float, index: mit.UInt32, active: Mask = True) -> mit.Point3f:
     """Gather points of a table.
 
     Args:

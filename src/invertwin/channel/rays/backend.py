@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
@@ -30,6 +30,8 @@ else:
 
     mit = _Untyped()
 
+Mask: TypeAlias = mit.Bool | bool
+"""Which lanes take part: one value for each, or one for all."""
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, tangent_frame, to_float, to_index
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.scene_tables import Geometry
 from invertwin.channel.rays.topology import morton_order
 
@@ -144,7 +144,7 @@ class BoundingSpheres:
         axis = dr.select(outside, offset / distance, mi.Vector3f(0, 0, 1))
         return axis, dr.select(outside, _cap_height(radius / distance), 2.0), outside
 
-    def face_group(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.UInt32:
+    def face_group(self, face: mit.UInt32, active: Mask = True) -> mit.UInt32:
         """Look up the groups of triangles.
 
         Args:

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 
 #: Most tests of such a scene: with 24, paths take three quarters of their time; from 40 on, more.
 MAX_TESTS = 24
@@ -67,7 +67,7 @@ class BruteForceIntersector:
         self._halves = to_index(rows)
 
     def find_nearest(
-        self, ray: mit.Ray3f, active: mit.Bool | bool
+        self, ray: mit.Ray3f, active: Mask
     ) -> tuple[mit.Bool, mit.UInt32, mit.Float, mit.Float, mit.Float]:
         """Find the first triangle on rays.
 
@@ -98,7 +98,7 @@ class BruteForceIntersector:
         )
         return valid, half.x, b1, b2, far
 
-    def is_blocked(self, ray: mit.Ray3f, active: mit.Bool | bool) -> mit.Bool:
+    def is_blocked(self, ray: mit.Ray3f, active: Mask) -> mit.Bool:
         """Test whether any triangle is on rays.
 
         Args:

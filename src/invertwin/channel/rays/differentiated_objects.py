@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from invertwin.channel.rays.arrays import opaque, to_index
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres, LoopRecorder, sample_cap
 from invertwin.channel.rays.topology import Topology
 
@@ -50,7 +50,7 @@ class DifferentiatedObjects:
         self._numbers = to_index(torch.nonzero(differentiated)[:, 0])
         self._count = opaque(int(differentiated.sum()))
 
-    def has_object(self, owner: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
+    def has_object(self, owner: mit.UInt32, active: Mask = True) -> mit.Bool:
         """Test whether objects carry derivatives.
 
         Args:
@@ -59,7 +59,7 @@ class DifferentiatedObjects:
         """
         return dr.gather(mi.UInt32, self._differentiated, owner, active) > 0
 
-    def has_face(self, face: mit.UInt32, active: mit.Bool | bool = True) -> mit.Bool:
+    def has_face(self, face: mit.UInt32, active: Mask = True) -> mit.Bool:
         """Test whether triangles belong to objects with derivatives.
 
         Args:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from invertwin.channel.paths import Link
 from invertwin.channel.rays import arrays, surface_point
-from invertwin.channel.rays.backend import backend, dr, mi, mit, tracing
+from invertwin.channel.rays.backend import Mask, backend, dr, mi, mit, tracing
 from invertwin.channel.rays.bounding_spheres import BoundingSpheres, State
 from invertwin.channel.rays.brute_force import BruteForceIntersector
 from invertwin.channel.rays.differentiated_objects import DifferentiatedObjects
@@ -88,9 +88,7 @@ class Occluders:
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             return dr.while_loop(state, going, step, mode="symbolic")
 
-    def is_clear(
-        self, start: mit.Point3f, end: mit.Point3f, active: mit.Bool | bool = True
-    ) -> mit.Bool:
+    def is_clear(self, start: mit.Point3f, end: mit.Point3f, active: Mask = True) -> mit.Bool:
         """Test whether segments are unobstructed (the surfaces of their ends excluded).
 
         Args:
@@ -209,7 +207,7 @@ class RayScene(Occluders):
         """Vertices in float64, three numbers each."""
         return arrays.to_double(self.geometry.vertices.detach() - self.origin)
 
-    def exact_vertex(self, vertex: mit.UInt32, active: mit.Bool | bool = True) -> mit.Vector3d:
+    def exact_vertex(self, vertex: mit.UInt32, active: Mask = True) -> mit.Vector3d:
         """Gather vertices in float64.
 
         Args:
@@ -253,9 +251,7 @@ class RayScene(Occluders):
         """
         return mi.UInt32(0) if self._scene_of_object is None else frame // self.poses_per_scene
 
-    def is_in_scene(
-        self, frame: mit.UInt32, face: mit.UInt32, active: mit.Bool | bool = True
-    ) -> mit.Bool:
+    def is_in_scene(self, frame: mit.UInt32, face: mit.UInt32, active: Mask = True) -> mit.Bool:
         """Test whether triangles belong to the scene of a radar pose.
 
         A ray ends when it leaves its scene, whatever it meets in another one.
@@ -270,7 +266,7 @@ class RayScene(Occluders):
         owner = dr.gather(mi.UInt32, self.topology.device_face_object, face, active)
         return dr.gather(mi.UInt32, self._scene_of_object, owner, active) == self.frame_scene(frame)
 
-    def corners(self, face: mit.UInt32, active: mit.Bool | bool = True) -> Triangle:
+    def corners(self, face: mit.UInt32, active: Mask = True) -> Triangle:
         """Gather the corners of triangles, detached.
 
         Args:

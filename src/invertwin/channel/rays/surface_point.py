@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from invertwin.channel.rays.arrays import gather_points
-from invertwin.channel.rays.backend import dr, mi, mit
+from invertwin.channel.rays.backend import Mask, dr, mi, mit
 
 Triangle = tuple[mit.Point3f, mit.Point3f, mit.Point3f]
 
@@ -25,7 +25,7 @@ class SurfacePoint:
 
 
 def corners(
-    vertices: mit.Float, faces: mit.UInt32, face: mit.UInt32, active: mit.Bool | bool = True
+    vertices: mit.Float, faces: mit.UInt32, face: mit.UInt32, active: Mask = True
 ) -> Triangle:
     """Gather the corners of triangles.
 
