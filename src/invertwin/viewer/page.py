@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -133,15 +134,8 @@ def page_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
         display: What is shown.
         sensors: As of `view_html`.
     """
-    title = html.escape(display.title)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{content_security_policy()}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>:root {{ color-scheme: light dark; }} "
-        "body { font: 15px/1.5 system-ui, sans-serif; margin: 1rem; }</style></head>\n"
-        f"<body><h1>{title}</h1>\n{view_html(display, sensors)}</body></html>\n"
-    )
+    parts = {"title": html.escape(display.title), "policy": content_security_policy()}
+    return Template(_resource("document.html")).substitute(parts, view=view_html(display, sensors))
 
 
 def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None = None) -> str:
