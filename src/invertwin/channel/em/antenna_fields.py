@@ -8,8 +8,6 @@ from invertwin.channel.em.plane_waves import cross, polarisations
 from invertwin.channel.paths import Link, Paths, make_paths
 from invertwin.scene.polarisation import Polarisation
 
-_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)  # of the radar
-
 
 def antenna_fields(
     jones: Polarisation, rotation: Float64[Tensor, "row 3 3"], direction: Float64[Tensor, "row 3"]
@@ -24,7 +22,7 @@ def antenna_fields(
         direction: unit vectors away from the antenna, in world axes.
     """
     local = torch.einsum("nij,ni->nj", rotation, direction)
-    axes = torch.einsum("nij,npj->npi", rotation, polarisations(-local, _UP))
+    axes = torch.einsum("nij,npj->npi", rotation, polarisations(-local))
     return jones.evaluate(local) @ axes.to(torch.complex128)
 
 

@@ -22,6 +22,7 @@ _Triangles: TypeAlias = Float64[Tensor, "*#row 3 3"]
 _Axes = Float64[Tensor, "row 2 3"]
 Waves: TypeAlias = Complex128[Tensor, "row 2 3"]
 Vectors = Float64[Tensor, "*row 3"]  # of any leading shape
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 class SmoothInterfaces(NamedTuple):
@@ -70,7 +71,7 @@ def cross(first: Tensor, second: Tensor) -> Tensor:
     return torch.linalg.cross(first.to(kind), second.to(kind))
 
 
-def polarisations(direction: Vectors, up: Float64[Tensor, "3"]) -> Float64[Tensor, "*row 2 3"]:
+def polarisations(direction: Vectors, up: Float64[Tensor, "3"] = UP) -> Float64[Tensor, "*row 2 3"]:
     """Polarisation basis vectors V and H for given directions.
 
     H = up × u and V = H × u: with up = z they are the unit vectors of θ and φ. For directions along

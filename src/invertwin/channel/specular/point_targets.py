@@ -8,7 +8,7 @@ and the target (``specular.trace_paths``).
 import math
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128
 from torch import Tensor
 
 from invertwin.channel.em.antenna_fields import antenna_fields, coherent_paths
@@ -20,8 +20,6 @@ from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.scene.scene import Scene
-
-_UP = (0.0, 0.0, 1.0)  # vertical axis of V in ``RayPaths``
 
 
 def trace_point_targets(
@@ -119,7 +117,7 @@ def fields_at_target(
         transmits: True for the transmitter, False for the receiver.
     """
     amplitudes = antenna_amplitudes(link, legs, transmits=transmits)
-    axes = _polarisation_axes(legs.arrival).to(amplitudes.dtype)
+    axes = polarisations(legs.arrival).to(amplitudes.dtype)
     return torch.einsum("nij,nkj,nix->nkx", legs.coefficient, amplitudes, axes)
 
 
@@ -138,9 +136,5 @@ def antenna_amplitudes(
     positive = gain > 0  # the square root has no derivative at zero
     strength = torch.where(positive, torch.where(positive, gain, 1.0).sqrt(), 0.0)
     fields = antenna_fields(jones, rotation, legs.departure)
-    axes = _polarisation_axes(legs.departure).to(fields.dtype)
+    axes = polarisations(legs.departure).to(fields.dtype)
     return strength[:, None, None] * torch.einsum("nkx,nix->nki", fields, axes)
-
-
-def _polarisation_axes(direction: Float64[Tensor, "row 3"]) -> Float64[Tensor, "row 2 3"]:
-    return polarisations(direction, torch.tensor(_UP, dtype=torch.float64))

@@ -45,7 +45,6 @@ from invertwin.scene.scene import Scene
 _MAX_DEPTH, _MAX_EDGES = 6, 3
 _ROWS_AT_ONCE = 1 << 15
 _EDGE_ROWS_AT_ONCE = 1 << 13  # diffracted paths need more memory a row
-_UP = (0.0, 0.0, 1.0)
 _AT_REST = (0.0, 0.0, 0.0)
 _Columns = dict[str, Tensor]  # columns of `RayPaths` by name
 _VELOCITY_HINT = "give one vector, or one per antenna"
@@ -258,9 +257,8 @@ def _diffracted_columns(
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
     ways = found.directions.unbind(1)
     departure, arrival = ways[0], -ways[-1]
-    up = torch.tensor(_UP, dtype=torch.float64)
     sent, received = (
-        plane_waves.polarisations(way, up).to(found.transfer) for way in (departure, arrival)
+        plane_waves.polarisations(way).to(found.transfer) for way in (departure, arrival)
     )
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
@@ -341,8 +339,7 @@ def _transfer_matrix(
     path_scene: PathScene, paths: SpecularPaths, directions: list[Tensor], normal: Tensor
 ) -> Complex128[Tensor, "path 2 2"]:
     """Polarisation transfer matrix between V and H at both ends, without spreading."""
-    up = torch.tensor(_UP, dtype=torch.float64)
-    before = plane_waves.polarisations(directions[0], up)
+    before = plane_waves.polarisations(directions[0])
     matrix = torch.eye(2, dtype=torch.complex128).expand(len(before), 2, 2)
     cosine = plane_waves.dot(torch.stack(directions, 1)[:, :-1], normal).abs()
     found = _face_coefficients(path_scene, paths.faces.ravel(), cosine.ravel())
@@ -355,7 +352,7 @@ def _transfer_matrix(
         passes = torch.stack([t_s[step], t_p[step]], 1)
         matrix = torch.where(through, passes, mirrors)[..., None] * matrix
         before = torch.cat([across, torch.where(through[..., None], into, out)], 1)
-    return _change_of_basis(plane_waves.polarisations(-directions[-1], up), before) @ matrix
+    return _change_of_basis(plane_waves.polarisations(-directions[-1]), before) @ matrix
 
 
 def _change_of_basis(new: Tensor, old: Tensor) -> Tensor:
