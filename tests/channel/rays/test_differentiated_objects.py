@@ -15,8 +15,7 @@ from invertwin.channel.power.silhouettes import SilhouetteSampler
 from invertwin.channel.rays import ray_scene
 from invertwin.channel.rays.arrays import to_torch
 from invertwin.channel.rays.backend import dr, mi, tracing
-from invertwin.channel.rays.differentiated_objects import NO_TARGET
-from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.ray_scene import NO_TARGET, RayScene
 from invertwin.channel.rays.scene_tables import flatten
 from invertwin.scene import Mesh, Object, RoughDielectric, Scene, box, plate, rigid, sphere
 from scenes import GRID, WAVELENGTH, float64, link, thing

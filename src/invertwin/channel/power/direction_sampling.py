@@ -16,13 +16,12 @@ from invertwin.channel.power.surface import ScatteringLawTables, gaussian, opaqu
 from invertwin.channel.rays.arrays import tangent_frame, to_float
 from invertwin.channel.rays.backend import dr, mi, mit
 from invertwin.channel.rays.bounding_spheres import sample_cap
-from invertwin.channel.rays.ray_scene import RayScene
+from invertwin.channel.rays.ray_scene import NO_TARGET, RayScene
 from invertwin.scene import ScatteringLaw
 
 _AIMED_FRACTION = 0.5  # share of the directions that aim at other objects, if there are any
 
 _MAX_TRIES = 4  # random choices of an object whose bounding sphere excludes the point
-_NO_TARGET = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class DirectionSampler:
         """
         facing = mi.Normal3f(dr.mulsign(point.normal, dr.dot(point.normal, incident)))
         omega = self._sample_lobes(point, incident, facing, numbers)
-        group, aimed = mi.UInt32(_NO_TARGET), mi.UInt32(_NO_TARGET)
+        group, aimed = mi.UInt32(NO_TARGET), mi.UInt32(NO_TARGET)
         spheres = self.spheres
         if spheres.max_objects > 1:
             towards, rest = numbers[4] < _AIMED_FRACTION, numbers[5]
@@ -92,11 +91,11 @@ class DirectionSampler:
                 rest -= number
                 index = drawn * spheres.group_size + number
                 direction, cap, outside = spheres.cap(index, point.position)
-                taken = towards & outside & (aimed == _NO_TARGET)
+                taken = towards & outside & (aimed == NO_TARGET)
                 axis, height = dr.select(taken, direction, axis), dr.select(taken, cap, height)
                 aimed = dr.select(taken, index, aimed)
-            omega = dr.select(aimed != _NO_TARGET, sample_cap(axis, height, numbers[2:4]), omega)
-            group = dr.select(towards, drawn, _NO_TARGET)
+            omega = dr.select(aimed != NO_TARGET, sample_cap(axis, height, numbers[2:4]), omega)
+            group = dr.select(towards, drawn, NO_TARGET)
         density = self._lobe_density(point, incident, facing, omega)
         if self.surfaces.has_refracting_bodies:
             invalid = dr.squared_norm(omega) < 0.5
@@ -137,7 +136,7 @@ class DirectionSampler:
         share: mit.Float = _AIMED_FRACTION / groups  # type: ignore[operator]
         scattered = 1 - _AIMED_FRACTION + share * failing**_MAX_TRIES
         density = scattered * sample.lobe_density + share * tries / members * found
-        return dr.select((sample.group == _NO_TARGET) | (sample.group == group), density, 0.0)
+        return dr.select((sample.group == NO_TARGET) | (sample.group == group), density, 0.0)
 
     def _sample_lobes(
         self,

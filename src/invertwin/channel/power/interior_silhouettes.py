@@ -8,7 +8,7 @@ from invertwin.channel.power.integrand import Inputs
 from invertwin.channel.power.mesh_folds import is_hidden_by_fold
 from invertwin.channel.rays.arrays import gather_points, sample_sphere, scramble_seed, uniform_pair
 from invertwin.channel.rays.backend import dr, mi, mit
-from invertwin.channel.rays.differentiated_objects import NO_TARGET, DifferentiatedObjects
+from invertwin.channel.rays.ray_scene import NO_TARGET, DifferentiatedObjects
 from invertwin.channel.rays.surface_point import face_normal, interpolate_position
 
 
