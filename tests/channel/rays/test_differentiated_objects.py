@@ -61,9 +61,9 @@ def drawn(scene: Scene, samples: int = 4000) -> tuple[Tensor, Tensor]:
         rays = RayScene(geometry, link(), differentiate_antennas=False)
         sampler = SilhouetteSampler(Inputs.from_rays(rays), ("tx",), samples, 1)
         points = sampler.draw(dr.arange(mi.UInt32, samples)).compress()
-        first, face = to_torch(mi.Int32(points.first_vertex)), to_torch(mi.Int32(points.face))
-        owner = geometry.topology.vertex_object
-        return owner[first.long()], geometry.face_object[face.long()]
+        edge, face = to_torch(mi.Int32(points.edge)), to_torch(mi.Int32(points.face))
+        owner = geometry.topology.vertex_object[geometry.topology.edges[:, 0]]
+        return owner[edge.long()], geometry.face_object[face.long()]
 
 
 def test_samples_go_where_something_moves():
@@ -208,7 +208,8 @@ def test_shadows_of_things_at_rest_on_what_moves_are_found_more_often(monkeypatc
             rays = RayScene(geometry, link(), differentiate_antennas=False)
             sampler = InteriorSilhouetteSampler(Inputs.from_rays(rays), 100_000, 1)
             points = sampler.draw(dr.arange(mi.UInt32, sampler.size)).compress()
-            owner = geometry.topology.vertex_object[to_torch(mi.Int32(points.first_vertex)).long()]
+            owner = geometry.topology.vertex_object[geometry.topology.edges[:, 0]]
+            owner = owner[to_torch(mi.Int32(points.edge)).long()]
             return int((owner != 2).sum())
 
     aimed = kept()

@@ -61,15 +61,15 @@ def project_silhouettes(rays: RayScene, points: SilhouetteSample) -> ProjectedSi
         points: Points on silhouettes.
     """
     geometry, link = rays.geometry, rays.link
-    indices = points.frame, points.first_vertex, points.second_vertex, points.face
-    frame, first, second, face = (to_torch(column).long() for column in indices)
+    indices = points.frame, points.edge, points.face
+    frame, edges, face = (to_torch(column).long() for column in indices)
     numbers = points.side, points.edge_parameter, points.weight
     side, share, weight = (to_torch(column).double() for column in numbers)
     receiver = points.is_receiver
     receiver = torch.tensor(receiver) if isinstance(receiver, bool) else to_torch(receiver).bool()
     tx, rx, from_receiver = link.tx[frame], link.rx[frame], receiver.reshape(-1, 1)
     c, other = torch.where(from_receiver, rx, tx), torch.where(from_receiver, tx, rx)
-    y0, y1 = geometry.vertices[first], geometry.vertices[second]
+    y0, y1 = geometry.vertices[rays.topology.edges[edges]].unbind(1)
     y = y0 + (y1 - y0) * share[:, None]
     p0, p1, p2 = geometry.corners(face)
     plane = torch.linalg.cross(p1 - p0, p2 - p0)

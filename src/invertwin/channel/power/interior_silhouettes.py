@@ -115,13 +115,12 @@ class InteriorSilhouetteSampler:
         Args:
             index: sample numbers below ``size``.
         """
-        rays, topology, moving = self.rays, self.rays.topology, self.rays.differentiated_objects
+        rays, moving = self.rays, self.rays.differentiated_objects
         pose, within = index // self.samples_per_pose, index % self.samples_per_pose
         edge, along, pmf = sample_edge_point(
             self.choice, within, self.samples_per_pose, self.seeds[0], index
         )
         frame = rays.edge_scene(edge) * rays.poses_per_scene + pose
-        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
         exact_point = y0 + (y1 - y0) * mi.Float64(along)
         omega, density = self._sample_direction(index, edge, y0, y1)
@@ -158,7 +157,7 @@ class InteriorSilhouetteSampler:
         point = interpolate_position(triangle, source.b1, source.b2)
         measure = dr.squared_norm(point - y) / dr.abs(dr.dot(face_normal(triangle), omega))
         probability = behind.probability * ahead.probability
-        place = index, False, frame, first, second, sides.side, along, ahead.point.face
+        place = index, False, frame, edge, sides.side, along, ahead.point.face
         weight = measure / (pmf * density * self.samples_per_pose * probability)
         passed = behind.transmission.then(ahead.transmission), sides.open, sides.covered
         samples = silhouettes.SilhouetteSample(*place, weight, *passed, source)

@@ -50,7 +50,7 @@ class SilhouetteSample:
         is_receiver: True for silhouettes as the receiver sees them; False if one visibility test
             serves both antennas.
         frame: radar poses.
-        first_vertex, second_vertex: vertex indices of the ends of the edge.
+        edge: edges of the topology.
         side: ±1, the sign with which ray × edge points to the covered side.
         edge_parameter: position from the first to the second end, 0 to 1.
         face: triangle on which the shadow falls.
@@ -65,8 +65,7 @@ class SilhouetteSample:
     index: mit.UInt32
     is_receiver: Mask
     frame: mit.UInt32
-    first_vertex: mit.UInt32
-    second_vertex: mit.UInt32
+    edge: mit.UInt32
     side: mit.Float
     edge_parameter: mit.Float
     face: mit.UInt32
@@ -192,10 +191,9 @@ class SilhouetteSampler:
         Args:
             index: sample numbers below ``size``.
         """
-        rays, topology = self.rays, self.rays.topology
+        rays = self.rays
         entry, along, pmf = sample_edge_point(self.choice, index, self.size, self.seed)
         edge, frame, receiver, origin = self._decode_entry(entry)
-        first, second = (dr.gather(mi.UInt32, ends, edge) for ends in topology.device_edges)
         y0, y1 = rays.exact_ends(edge)
         y = y0 + (y1 - y0) * mi.Float64(along)
         exact = y - mi.Vector3d(origin)
@@ -217,7 +215,7 @@ class SilhouetteSampler:
         # Last, since it takes longest: packets without a shadow skip it.
         near = MISS_DISTANCE * dr.norm(exact)
         valid &= ~is_hidden_by_fold(rays, edge, y, exact, sides.outward, aside, near, valid)
-        place = index, receiver, frame, first, second, sides.side, along, face
+        place = index, receiver, frame, edge, sides.side, along, face
         weight = 1 / (pmf * self.size * hit.probability)
         transmission = before.then(hit.transmission)
         samples = SilhouetteSample(*place, weight, transmission, sides.open, sides.covered)
@@ -416,7 +414,7 @@ def shadow_speed(
         sampling density, attached.
     """
     c, fixed = source, inputs.detach()
-    ends = samples.first_vertex, samples.second_vertex
+    ends = (dr.gather(mi.UInt32, e, samples.edge) for e in inputs.rays.topology.device_edges)
     y0, y1 = (gather_points(inputs.vertices, end) for end in ends)
     y = y0 + (y1 - y0) * samples.edge_parameter  # type: ignore[operator]
     triangle = p0, p1, p2 = integrand.corners(inputs, samples.face)
