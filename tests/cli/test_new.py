@@ -17,6 +17,7 @@ KINDS = {
     "simulate": "simulate",
     "twin": "twin",
     "coverage": "simulate",
+    "placement": "reconstruct",
     "dataset": "dataset",
 }
 

@@ -184,7 +184,8 @@ def convert(files: command_options.FilesArgument) -> None:
 @app.command(rich_help_panel=_LEARN)
 def new(
     kind: Annotated[
-        Literal["fit", "simulate", "twin", "coverage", "dataset", "plugin"], typer.Argument()
+        Literal["fit", "simulate", "twin", "coverage", "placement", "dataset", "plugin"],
+        typer.Argument(),
     ],
     file: Annotated[Path | None, argument("Default: kind.toml, or plugin.py.")] = None,
 ) -> None:
@@ -197,7 +198,8 @@ def new(
         raise InputError(f"expected a new file, got {path}, which exists; name another")
     with path.open("x", encoding="utf-8") as out:
         out.write(text)
-    command = {"fit": "reconstruct", "coverage": "simulate"}.get(kind, kind)
+    tasks = {"fit": "reconstruct", "coverage": "simulate", "placement": "reconstruct"}
+    command = tasks.get(kind, kind)
     call = shlex.join([*(["python"] if kind == "plugin" else ["invertwin", command]), str(path)])
     console.print(f"wrote {path}; try: {call}", markup=False, soft_wrap=True)
 
@@ -352,6 +354,8 @@ def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path
 def _reconstruct_sections(run: Any) -> tuple[str, ...]:
     if run.placement is not None:
         return ("reconstruct", "parameters")
+    if run.aim is not None:
+        return ("reconstruct", "map", "transmitter", "parameters")
     return ("reconstruct", "data", "grid" if run.map is None else "transmitter", "parameters")
 
 

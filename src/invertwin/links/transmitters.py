@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 
 from invertwin.checks import ArrayLike, checked_rows, checked_tensor, set_fields, to_tensor
 from invertwin.errors import InputError
-from invertwin.limits import Axes
+from invertwin.limits import Axes, NonNegative
 from invertwin.links.responses import AntennaMount
+from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
 
 
@@ -57,11 +58,54 @@ class Transmitters:
         return Transmitters(self.positions[rows], terminals, torch.as_tensor(self.power_dbm)[rows])
 
 
+class FreeSpace:
+    """Places that keep a distance from all surfaces of a scene, outside of solid objects.
+
+    Args:
+        scene: Objects, as they are now. One that holds the whole box is a room, not a solid object.
+        low, high: Opposite corners of the box [3] [m].
+        clear: Least distance [m].
+    """
+
+    def __init__(self, scene: Scene, low: ArrayLike, high: ArrayLike, clear: float) -> None:
+        box = torch.stack([torch.as_tensor(end, dtype=torch.float64) for end in (low, high)])
+        items = scene.objects.values()
+        self._meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in items]
+        self._signs = [
+            -1.0 if bool((signed_distance(mesh, box) < 0).all()) else 1.0 for mesh in self._meshes
+        ]
+        self._clear = clear
+
+    def contains(self, places: Float64[Tensor, "place 3"]) -> Bool[Tensor, " place"]:
+        """Return for each place whether it is free.
+
+        Args:
+            places: Places [m].
+        """
+        pairs = zip(self._signs, self._meshes, strict=True)
+        return torch.stack([s * signed_distance(m, places) >= self._clear for s, m in pairs]).all(0)
+
+    def shorten_step(
+        self, begin: Float64[Tensor, "3"], end: Float64[Tensor, "3"]
+    ) -> Float64[Tensor, "3"]:
+        """Return the end of a step; one that is not free loses the axes that lead there.
+
+        Args:
+            begin: A free place [m].
+            end: The place to go to [m].
+        """
+        kept = torch.cartesian_prod(*[torch.tensor([1.0, 0.0], dtype=begin.dtype)] * 3)
+        steps = kept * (end - begin)
+        steps = steps[self.contains(begin + steps)]
+        return begin + steps[steps.norm(dim=1).argmax()] if len(steps) else begin
+
+
 class TransmitterPosition(nn.Module):
     """Module Transmitters → Transmitters with the position of one transmitter as parameter.
 
     With a box, such as a room, the position stays inside the box: a step that leaves it is clamped
-    to its border.
+    to its border. With ``clear`` it also keeps a distance from the surfaces of a scene: a step that
+    comes nearer loses the axes that lead there, so the position slides along furniture.
 
     Args:
         initial: Initial position [3] [m].
@@ -69,13 +113,16 @@ class TransmitterPosition(nn.Module):
         high: Opposite corner of the box [3] [m].
         axes: World axes along which the position is fitted; other coordinates are fixed.
         number: Index of the transmitter.
+        clear: Least distance to all surfaces, outside of solid objects [m]; needs the box. None =
+            anywhere in the box.
+        scene: Scene whose surfaces are meant.
 
     Attributes:
         place: Parameter [3], position [m].
 
     Raises:
-        InputError: A wrong shape, an unknown axis, only one corner, or an initial position outside
-            the box.
+        InputError: A wrong shape, an unknown axis, only one corner, ``clear`` without a box or a
+            scene, or an initial position outside the box or too near to a surface.
     """
 
     def __init__(
@@ -85,6 +132,8 @@ class TransmitterPosition(nn.Module):
         high: ArrayLike | None = None,
         axes: Axes = "xyz",
         number: int = 0,
+        clear: NonNegative | None = None,
+        scene: Scene | None = None,
     ) -> None:
         super().__init__()
         do = "give x, y, z"
@@ -105,6 +154,17 @@ class TransmitterPosition(nn.Module):
                     "expected an initial place inside the box, got one outside or on its border; "
                     "choose another start or a larger box"
                 )
+        self._free = None
+        if clear is not None:
+            if scene is None or low is None or high is None:
+                raise InputError("expected a scene, low and high with clear, got less; give all")
+            self._free = FreeSpace(scene, low, high, clear)
+            if not bool(self._free.contains(begun[None])):
+                raise InputError(
+                    f"expected an initial place at least {clear:g} m off all surfaces, got one "
+                    "that is nearer or inside of an object; choose another start or lower clear"
+                )
+            self.register_buffer("free_position", begun.clone())
         self.raw_position = nn.Parameter(begun)
 
     @property
@@ -113,6 +173,10 @@ class TransmitterPosition(nn.Module):
         if self._box is not None:
             with torch.no_grad():
                 self.raw_position.data.clamp_(*self._box)
+                if self._free is not None:
+                    found = self._free.shorten_step(self.free_position, self.raw_position.data)
+                    self.raw_position.data.copy_(found)
+                    self.free_position.copy_(found)
         return free_part(self.raw_position, self._axes)
 
     def forward(self, sensor: Transmitters) -> Transmitters:

@@ -7,6 +7,7 @@ from invertwin.cli.fits.panel_coverage import PanelCoverage
 from invertwin.cli.fits.problem import DataKind, Problem
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.received_levels import ReceivedLevels
+from invertwin.cli.fits.transmitter_coverage import TransmitterCoverage
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
@@ -19,6 +20,8 @@ def kind_of(run: RunFile) -> DataKind:
     """The kind of data that a run file fits."""
     if run.placement is not None:
         return PanelCoverage()
+    if run.aim is not None:
+        return TransmitterCoverage()
     if run.map is not None:
         return ReceivedLevels()
     if isinstance(next(iter(run.parameters), None), MovingTargetParameter):

@@ -15,7 +15,7 @@ from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.fits.problem import Problem, SensorData, about_sensor, sensor_runs, stage_runs
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
-from invertwin.cli.schema.recordings import build_capture
+from invertwin.cli.schema.recordings import DEFAULT_POINTS_PER_M2, build_capture
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import InitialPoseEstimator, pose_error
@@ -25,7 +25,6 @@ from invertwin.radar.surrogate.surrogate import Surrogate
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 
-_DEFAULT_POINTS_PER_M2 = 2_000.0
 _RECORDING_SEED_KEY = 2**16  # key of the seeds of recordings, beyond those of sensors
 
 
@@ -138,7 +137,7 @@ def make_sampling(run: RunFile) -> Sampling:
 
 def rough_point_densities(run: RunFile) -> Densities:
     """Points per m² of rough surfaces in exact signals: those of simulated data, or enough."""
-    return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else _DEFAULT_POINTS_PER_M2
+    return run.data.points_per_m2 if isinstance(run.data, SimulatedData) else DEFAULT_POINTS_PER_M2
 
 
 def make_radar_models(problem: Problem) -> list[ForwardModel]:

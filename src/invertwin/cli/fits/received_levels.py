@@ -95,7 +95,7 @@ class ReceivedLevels(DataKind):
             box = table.build()
         item = problem.first_sensor
         position = _power_centroid(problem, (box.low, box.high))
-        sensor = _place_first(item.sensor, position)
+        sensor = place_first(item.sensor, position)
         notes = {**problem.notes, "initial_position": position.tolist()}
         return replace(problem, sensor_data={"": replace(item, sensor=sensor)}, notes=notes)
 
@@ -120,12 +120,12 @@ class ReceivedLevels(DataKind):
     def initial_sensor(self, item: SensorData, start: Start) -> Transmitters:
         """The transmitters, the first one where the fit starts."""
         place = start.transmitter
-        return item.sensor if place is None else _place_first(item.sensor, place)
+        return item.sensor if place is None else place_first(item.sensor, place)
 
     def make_unknown(self, problem: Problem, name: str, table: Any, start: Start) -> Unknown:
         """See ``DataKind.make_unknown``; a transmitter starts where its sensor has it."""
         if table.kind == "transmitter":
-            return Unknown(partial(_build_position, table, name), table.rate)
+            return Unknown(partial(_build_position, table, name, problem.scene), table.rate)
         return super().make_unknown(problem, name, table, start)
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
@@ -177,7 +177,7 @@ class ReceivedLevels(DataKind):
         """See ``DataKind.summary``."""
         drawn = [save_picture(folder, "loss", plotting.convergence(fits.losses))]
         if has_transmitter(fits.problem.run):
-            drawn.append(save_picture(folder, "plan", _plan(fits)))
+            drawn.append(save_picture(folder, "plan", draw_plan(fits)))
         values = parameter_values(fits)
         for name, real in metrics.get("true_values", {}).items():
             values[name][2] = real
@@ -217,14 +217,19 @@ def _with_positions(sensor: Transmitters, positions: Sequence[Sequence[float]]) 
     return replace(sensor, positions=places)
 
 
-def _place_first(sensor: Transmitters, position: Tensor) -> Transmitters:
-    """The transmitters with the first one at a position."""
+def place_first(sensor: Transmitters, position: Tensor) -> Transmitters:
+    """Return the transmitters with the first one elsewhere.
+
+    Args:
+        sensor: The transmitters.
+        position: Of the first one [3] [m].
+    """
     return replace(sensor, positions=torch.cat([position[None], sensor.positions[1:]]))
 
 
-def _build_position(table: Any, name: str, sensor: Transmitters) -> Any:
+def _build_position(table: Any, name: str, scene: Scene, sensor: Transmitters) -> Any:
     with prefix_errors(f"parameters.{name}"):
-        return table.build(None, initial=sensor.positions[0])
+        return table.build(None, initial=sensor.positions[0], scene=scene)
 
 
 def _power_centroid(problem: Problem, box: Sequence[Tensor | None]) -> Tensor:
@@ -335,8 +340,12 @@ def _share_blocked_links(problem: Problem, found: Reconstruction) -> Row:
     return {"blocked_share": 1 - count / (len(ends[0]) * len(ends[1]))}
 
 
-def _plan(fits: Fits) -> Figure:
-    """Plan with the starts and ends of the fits of the first transmitter."""
+def draw_plan(fits: Fits) -> Figure:
+    """Draw a plan with the starts and ends of the fits of the first transmitter.
+
+    Args:
+        fits: All fits of a run.
+    """
     problem, place = fits.problem, fits.found.sensors[0].positions[:1].detach()
     real = problem.reference
     shown = {"found": place} if real is None else {"truth": real.positions[:1], "found": place}

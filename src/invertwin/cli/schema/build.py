@@ -118,6 +118,8 @@ def build_loss(run: RunFile) -> Callable[[Tensor, Tensor], Tensor]:
     """
     if run.placement is not None:
         return RatioLoss()
+    if run.aim is not None:
+        return run.aim.loss
     if run.loss is not None:
         found = build_section(run, "loss")
         plain = run.map is not None and "kind" not in run.loss.model_fields_set

@@ -1,9 +1,10 @@
 """The tables of radio maps: transmitters, receivers, and where fits start."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import MinLen
+from pydantic import model_validator
 from torch import Tensor
 
 from invertwin.cli.schema.fits import SamplingBase
@@ -11,12 +12,15 @@ from invertwin.cli.schema.sensors import Orientation, PolarisationValue
 from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
 from invertwin.links import AntennaMount, PropagationSettings, Transmitters
+from invertwin.links.metasurface.coverage import soft_quantile
+from invertwin.links.transmitters import FreeSpace
 from invertwin.models.radio import RadioMap
 from invertwin.registry.kinds import OneOf, TableOf, registry
-from invertwin.registry.section import Section, Seed, Vector, prefix_errors
-from invertwin.scene import AntennaArray, Mesh, Scene, signed_distance
+from invertwin.registry.section import Section, Seed, Vector, prefix_errors, raise_key_error
+from invertwin.scene import AntennaArray, Scene
 
 _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
+_SOFTNESS = 2.0  # dB, width of the smooth tenth and of the level of coverage in a fit
 
 
 class AntennaTable(Section):
@@ -126,15 +130,11 @@ class TransmitterStartsTable(Section):
         """
         generator = torch.Generator().manual_seed(seed if self.seed is None else self.seed)
         box = torch.tensor([self.low, self.high], dtype=torch.float64)
-        found: list[Tensor] = []
-        meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
-        # The room is no solid object: it holds the whole box.
-        around = [bool((signed_distance(mesh, box) < 0).all()) for mesh in meshes]
+        free, found = FreeSpace(scene, self.low, self.high, self.clear), list[Tensor]()
         for _ in range(_MAX_DRAWS):
             share = torch.rand(1, 3, generator=generator, dtype=torch.float64)
             place = box[0] + share * (box[1] - box[0])
-            off = zip((float(signed_distance(mesh, place)) for mesh in meshes), around, strict=True)
-            if all(abs(d) >= self.clear and (d > 0 or held) for d, held in off):
+            if bool(free.contains(place)):
                 found.append(place)
             if len(found) == self.count:
                 return torch.cat(found)
@@ -142,6 +142,65 @@ class TransmitterStartsTable(Section):
             f"expected room for {self.count} starts in the box, found {len(found)}; widen the box, "
             "or lower `clear`"
         )
+
+
+class AimTable(Section):
+    """What a transmitter is placed for, in place of data; a receiver has its strongest transmitter.
+
+    Attributes:
+        measure: mean level, worst_tenth (level below which a tenth of the receivers lies), or
+            coverage (share of the receivers above a level)
+        level: that counts as covered, in the unit of the map; with coverage only
+    """
+
+    measure: Literal["mean", "worst_tenth", "coverage"] = "worst_tenth"
+    level: float | None = None
+
+    @model_validator(mode="after")
+    def _check_level(self) -> "AimTable":
+        if self.measure == "coverage" and self.level is None:
+            raise_key_error('expected a level with "coverage", got none; add it', "level")
+        if self.measure != "coverage" and self.level is not None:
+            got = f'expected none with "{self.measure}", got {self.level:g}; remove it'
+            raise_key_error(f'{got}, or write measure = "coverage"', "level")
+        return self
+
+    def label(self, unit: str) -> str:
+        """Its name for people.
+
+        Args:
+            unit: Of the map.
+        """
+        if self.measure == "coverage":
+            return f"share of receivers above {self.level:g} {unit}"
+        return f"{self.measure.replace('_', ' ')} [{unit}]"
+
+    def evaluate(self, levels: Tensor, softness: float = 0.0) -> Tensor:
+        """The aim of a map.
+
+        Args:
+            levels: [tx, ...] in decibels.
+            softness: Width of its steps [dB].
+        """
+        best = levels.amax(0).flatten()
+        if self.measure == "mean":
+            return best.mean()
+        if self.measure == "worst_tenth":
+            return soft_quantile(best, 0.1, softness)
+        above = best - self.level
+        return ((above / softness).sigmoid() if softness else (above > 0).double()).mean()
+
+    def loss(self, levels: Tensor, before: Tensor) -> Tensor:
+        """What a fit lowers: the share that is not covered, or a ratio of amplitudes.
+
+        Args:
+            levels: [tx, ...] in decibels.
+            before: The same at the start of the fit.
+        """
+        value = self.evaluate(levels, _SOFTNESS)
+        if self.measure == "coverage":
+            return 1 - value
+        return 10 ** ((self.evaluate(before, _SOFTNESS) - value) / 20)
 
 
 AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("propagation",), checked=False)]

@@ -74,7 +74,10 @@ def register(registry: Registry) -> None:
     registry.add("data", "received", ReceivedData)
     registry.add("data", "received_file", ReceivedFile)
     registry.add(
-        "parameter", "transmitter", links.TransmitterPosition, without=("initial", "number")
+        "parameter",
+        "transmitter",
+        links.TransmitterPosition,
+        without=("initial", "number", "scene"),
     )
 
 

@@ -17,6 +17,9 @@ from invertwin.registry import section
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, registry
 from invertwin.registry.section import InputPath, prefix_errors
 
+DEFAULT_POINTS_PER_M2 = 2_000.0
+"""Rough points of exact signals: enough for a fit; figures take more."""
+
 
 class SimulatedData(section.Section):
     """Exact signals of the true scene, with noise.
@@ -34,7 +37,7 @@ class SimulatedData(section.Section):
     """
 
     kind: Literal["simulated"]
-    points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))]
+    points_per_m2: Annotated[Any, FormOf((Positive, dict[str, Positive]))] = DEFAULT_POINTS_PER_M2
     samples: Count = 200_000
     depth: section.Depth = 3
     mirrors: list[str] = []

@@ -16,7 +16,7 @@ from invertwin.cli.schema.dataset import DatasetTable
 from invertwin.cli.schema.fit_tables import SurrogateTable
 from invertwin.cli.schema.gradcheck import GradcheckTable
 from invertwin.cli.schema.placement import Placement
-from invertwin.cli.schema.radio import AnyMap, TransmitterStartsTable, TransmitterTable
+from invertwin.cli.schema.radio import AimTable, AnyMap, TransmitterStartsTable, TransmitterTable
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.cli.schema.sensors import AnyChirps, AnyGrid, AnyImpairments, AnyRadar
 from invertwin.cli.schema.shape_tables import LearnedTable, RoomTable
@@ -159,6 +159,7 @@ class _RunFile(Section):
         image: what [camera] shows; with [gradcheck] it is differentiated
         transmitter_starts: where fits of the first transmitter start; without it where
             [transmitter] says
+        aim: what [transmitter] is placed for, in place of [data]
         observations: [observations.<name>]: several sensors, each with its own data
         parameters: [[parameters]]: what is unknown
         starts: where fits start; without it where the scene says
@@ -204,6 +205,7 @@ class _RunFile(Section):
     camera: AnyCamera | None = None
     image: AnyImage | None = None
     transmitter_starts: TransmitterStartsTable | None = None
+    aim: AimTable | None = None
     observations: dict[str, ObservationTable] = {}
     parameters: list[Annotated[Any, OneOf("parameter")]] = []
     starts: fits.AnyStarts | None = None
@@ -356,9 +358,7 @@ class _RunFile(Section):
             )
         if self.data is not None and not isinstance(self.data, SimulatedData):
             got = f'expected "simulated" with [dataset], got "{self.data.kind}"'
-            raise_key_error(
-                f"{got}; give points_per_m2 and snr_db instead of a recording", "data.kind"
-            )
+            raise_key_error(f"{got}; give snr_db instead of a recording", "data.kind")
 
     def dump_without_dataset(self) -> dict[str, Any]:
         """As TOML, without what makes it a data set."""

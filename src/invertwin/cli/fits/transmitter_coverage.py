@@ -1,0 +1,148 @@
+"""Placement of a transmitter: an aim of its map in place of data."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from rich.console import Console
+
+from invertwin import plotting
+from invertwin.cli.fits import problem as problems
+from invertwin.cli.fits.problem import Fits, Problem, Row, SensorData, Start, Summary
+from invertwin.cli.fits.received_levels import (
+    ReceivedLevels,
+    draw_plan,
+    place_first,
+    radio_map,
+)
+from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.fits.writing import parameter_values
+from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
+from invertwin.cli.run_file import prefix_errors, require_section
+from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
+from invertwin.inversion import Reconstruction
+from invertwin.links import MapPlane, ReceiverPoints
+from invertwin.scene import Scene
+from invertwin.storage.run_folder import RunFolder
+
+_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB"}
+_CELLS = 1500  # of a drawn map
+
+
+class TransmitterCoverage(ReceivedLevels):
+    """An aim of the levels of receivers: their mean, their worst tenth, or the share covered."""
+
+    title: ClassVar[str] = "Placement of a transmitter"
+    unused: ClassVar[tuple[str, ...]] = (
+        *(*ReceivedLevels.unused, "data", "initial", "loss", "measures", "search", "starts"),
+    )
+
+    def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
+        """See ``DataKind.read_problem``; the fit starts at the best place of a few random ones."""
+        problems.require_sections(self, run, "[aim]")
+        model, aim = radio_map(run, None), require_section(run, "aim", "a placement")
+        if model.quantity not in _UNITS:
+            raise InputError(
+                f"map.quantity: expected {', '.join(_UNITS)} with [aim], got {model.quantity}; "
+                "choose one of these"
+            )
+        table = next((table for table in run.parameters if table.kind == "transmitter"), None)
+        if table is None or len(run.parameters) > 1:
+            raise InputError(
+                'parameters: expected kind = "transmitter" alone with [aim], got '
+                f"{', '.join(table.kind for table in run.parameters)}; leave only that"
+            )
+        with prefix_errors("transmitter"):
+            sensor = require_section(run, "transmitter", "[aim]").build()
+        places = sensor.positions[:1]
+        if run.transmitter_starts is not None:
+            with prefix_errors("transmitter_starts"):
+                clear = max(run.transmitter_starts.clear, table.clear or 0.0)
+                some = run.transmitter_starts.model_copy(update={"clear": clear})
+                places = some.sample_positions(scene, run.seed)
+        console.print(f"levels of {len(places)} places to start from")
+        sensors = [place_first(sensor, place) for place in places]
+        with torch.no_grad():
+            levels = [model.predict(scene, sensor, run.seed) for sensor in sensors]
+        tried = [float(aim.evaluate(one)) for one in levels]
+        # Where none covers anyone, the one that comes nearest is the best.
+        best = max(range(len(tried)), key=lambda k: (tried[k], -aim.loss(levels[k], levels[k])))
+        items = {"": SensorData((levels[best], None), sensors[best])}
+        return Problem(run, scene, truth, frozenset(), items, None, self, notes={"tried": tried})
+
+    def starts(self, problem: Problem) -> list[Start]:
+        """The best of the places that were compared."""
+        return [Start(problem.scene, problem.first_sensor.sensor.positions[0])]
+
+    def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
+        """The aim at the start and at the end, without softness."""
+        assert start.transmitter is not None
+        aim, ends = require_section(problem.run, "aim", "a placement"), []
+        with torch.no_grad():
+            for sensor in (place_first(found.sensors[0], start.transmitter), found.sensors[0]):
+                levels = radio_map(problem.run, None).predict(found.scene, sensor, problem.run.seed)
+                ends.append(float(aim.evaluate(levels)))
+        place = start.transmitter.tolist()
+        return {"start_position": place, "aim_before": ends[0], "aim_after": ends[1]}
+
+    def revise_confidence(self, fits: Fits, believed: Row) -> Row:
+        """An aim has no noise: nothing to compare the map with, and no error bars."""
+        word = believed["verdict"] if believed["verdict"] == "at a bound" else "unknown"
+        none = "an aim has no noise: there are no error bars"
+        return {"verdict": word, "verdict_reasons": [], "no_error_bars": none}
+
+    def metrics(self, fits: Fits) -> Row:
+        """See ``DataKind.metrics``."""
+        ends = {key: fits.best[key] for key in ("aim_before", "aim_after")}
+        return {**ends, "answer": _describe(fits)}
+
+    def summary(self, fits: Fits, metrics: Row, folder: RunFolder) -> Summary:
+        """See ``DataKind.summary``."""
+        drawn = [save_picture(folder, "plan", draw_plan(fits))]
+        drawn.append(save_picture(folder, "coverage", _draw_coverage(fits)))
+        drawn.append(save_picture(folder, "loss", plotting.convergence(fits.losses)))
+        aim = require_section(fits.problem.run, "aim", "a placement")
+        cells = [[aim.label(_unit(fits)), metrics["aim_before"], metrics["aim_after"]]]
+        reached = ReportTable("Aim", ["aim", "start", "placed"], cells)
+        tables = [reached, error_bar_table(metrics, parameter_values(fits))]
+        return Summary(metrics["answer"], quantity_table("Result", metrics), drawn, tables)
+
+
+def _unit(fits: Fits) -> str:
+    return _UNITS[radio_map(fits.problem.run, None).quantity]
+
+
+def _describe(fits: Fits) -> str:
+    """Where the transmitter belongs, and what that gains, in the units of the run file."""
+    tried, aim = (
+        fits.problem.notes["tried"],
+        require_section(fits.problem.run, "aim", "a placement"),
+    )
+    after, gain = fits.best["aim_after"], fits.best["aim_after"] - fits.best["aim_before"]
+    what = f"{aim.measure.replace('_', ' ')} {after:.1f} {_unit(fits)}, {gain:+.1f} dB"
+    if aim.measure == "coverage":
+        what = f"{aim.label(_unit(fits))} {100 * after:.0f} %, {100 * gain:+.0f} points"
+    place = format_place(fits.found.sensors[0].positions[0].tolist())
+    over = f"the best of {len(tried)} random places" if len(tried) > 1 else "the start"
+    return f"transmitter at ({place}) m: {what} over {over}"
+
+
+def _draw_coverage(fits: Fits) -> Any:
+    """Draw the map among the receivers, at the start and where the transmitter belongs."""
+    model, found = radio_map(fits.problem.run, None), fits.found.sensors[0]
+    at = model.places
+    if isinstance(at, ReceiverPoints):
+        low, high = at.positions.amin(0), at.positions.amax(0)
+        side = float((high - low)[:2].prod() / _CELLS) ** 0.5
+        at = MapPlane.horizontal(low[:2], high[:2], float((low + high)[2] / 2), side)
+        model = replace(model, places=ReceiverPoints(at.centres.reshape(-1, 3)))
+    ends = {"start": place_first(found, fits.start.transmitter), "placed": found}
+    with torch.no_grad():
+        levels = {
+            title: model.predict(fits.found.scene, sensor, fits.problem.run.seed).amax(0)
+            for title, sensor in ends.items()
+        }
+    maps = {title: values.view(at.shape) for title, values in levels.items()}
+    label = f"{model.quantity.replace('_', ' ')} [{_unit(fits)}]"
+    return plotting.coverage(maps, at, scene=fits.found.scene, transmitters=found, label=label)
