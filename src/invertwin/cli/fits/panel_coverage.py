@@ -43,7 +43,7 @@ class PanelCoverage(DataKind):
     title: ClassVar[str] = "Placement of a metasurface"
     unused: ClassVar[tuple[str, ...]] = (
         *("radar", "grid", "chirps", "data", "calibration", "landscape", "measures", "model"),
-        *("starts", "map", "initial"),
+        *("starts", "map", "initial", "aim"),
     )
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:

@@ -22,7 +22,7 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
-from invertwin.links import MapPlane, ReceiverPoints
+from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.scene import Scene
 from invertwin.storage.run_folder import RunFolder
 
@@ -138,6 +138,7 @@ def _draw_coverage(fits: Fits) -> Any:
         at = MapPlane.horizontal(low[:2], high[:2], float((low + high)[2] / 2), side)
         model = replace(model, places=ReceiverPoints(at.centres.reshape(-1, 3)))
     ends = {"start": place_first(found, fits.start.transmitter), "placed": found}
+    shown = Transmitters(torch.stack([sensor.positions[0] for sensor in ends.values()]))
     with torch.no_grad():
         levels = {
             title: model.predict(fits.found.scene, sensor, fits.problem.run.seed).amax(0)
@@ -145,4 +146,4 @@ def _draw_coverage(fits: Fits) -> Any:
         }
     maps = {title: values.view(at.shape) for title, values in levels.items()}
     label = f"{model.quantity.replace('_', ' ')} [{_unit(fits)}]"
-    return plotting.coverage(maps, at, scene=fits.found.scene, transmitters=found, label=label)
+    return plotting.coverage(maps, at, scene=fits.found.scene, transmitters=shown, label=label)

@@ -191,7 +191,7 @@ class AimTable(Section):
         return ((above / softness).sigmoid() if softness else (above > 0).double()).mean()
 
     def loss(self, levels: Tensor, before: Tensor) -> Tensor:
-        """What a fit lowers: the share that is not covered, or a ratio of amplitudes.
+        """What a fit lowers: the share that is not covered, or a ratio of powers.
 
         Args:
             levels: [tx, ...] in decibels.
@@ -200,7 +200,7 @@ class AimTable(Section):
         value = self.evaluate(levels, _SOFTNESS)
         if self.measure == "coverage":
             return 1 - value
-        return 10 ** ((self.evaluate(before, _SOFTNESS) - value) / 20)
+        return 10 ** ((self.evaluate(before, _SOFTNESS) - value) / 10)
 
 
 AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("propagation",), checked=False)]
