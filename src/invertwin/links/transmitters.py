@@ -164,6 +164,8 @@ class TransmitterPosition(nn.Module):
                     f"expected an initial place at least {clear:g} m off all surfaces, got one "
                     "that is nearer or inside of an object; choose another start or lower clear"
                 )
+            # A buffer: a checkpoint keeps where the last step was free.
+            self.free_position: Tensor
             self.register_buffer("free_position", begun.clone())
         self.raw_position = nn.Parameter(begun)
 

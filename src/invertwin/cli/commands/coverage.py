@@ -8,12 +8,11 @@ import numpy as np
 import torch
 
 from invertwin import plotting
-from invertwin.cli.fits.received_levels import radio_map
+from invertwin.cli.fits.received_levels import radio_map, require_drawn_places
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
-from invertwin.errors import InputError
-from invertwin.links import MapPlane, ReceiverPoints
+from invertwin.links import MapPlane
 from invertwin.storage.run_folder import RunFolder
 
 
@@ -23,9 +22,7 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     model = radio_map(run, None)
     with prefix_errors("transmitter"):
         sensor = require_section(run, "transmitter", "a coverage map").build()
-    places, unit = model.places, model.unit
-    if not isinstance(places, MapPlane | ReceiverPoints):
-        raise InputError("map.places: expected points or a plane, got a mesh; choose one of these")
+    places, unit = require_drawn_places(model), model.unit
     with torch.no_grad():
         values = model.predict(scene, sensor, run.seed)
     at = places.centres.reshape(-1, 3) if isinstance(places, MapPlane) else places.positions

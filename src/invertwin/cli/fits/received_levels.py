@@ -26,12 +26,14 @@ from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.inversion import Reconstruction, Unknown
 from invertwin.inversion.confidence.ambiguities import REJECTION_ZSCORE, difference_score
-from invertwin.links import ReceiverPoints, Transmitters
+from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.models.radio import RadioMap
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
+LEVEL_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB"}
+"""Units of the quantities of a map that are levels."""
 _POSED = ("translation", "pose", "scale", "body", "vertices", "mover")  # kinds of parameters
 _FEW_ENDS = 2  # of other starts: fewer say nothing about how ends scatter
 
@@ -199,6 +201,20 @@ def radio_map(run: RunFile, points: ReceiverPoints | None) -> RadioMap:
     with prefix_errors("map"):
         found = require_section(run, "map", "received levels").build()
     return found if points is None else replace(found, places=points)
+
+
+def require_drawn_places(model: RadioMap) -> MapPlane | ReceiverPoints:
+    """Return the receivers of a map that is drawn.
+
+    Args:
+        model: The map.
+
+    Raises:
+        InputError: They are the triangles of a mesh.
+    """
+    if not isinstance(model.places, MapPlane | ReceiverPoints):
+        raise InputError("map.places: expected points or a plane, got a mesh; choose one of these")
+    return model.places
 
 
 def has_transmitter(run: RunFile) -> bool:

@@ -10,10 +10,12 @@ from invertwin import plotting
 from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.received_levels import (
+    LEVEL_UNITS,
     ReceivedLevels,
     draw_plan,
     place_first,
     radio_map,
+    require_drawn_places,
 )
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.writing import parameter_values
@@ -26,7 +28,6 @@ from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.scene import Scene
 from invertwin.storage.run_folder import RunFolder
 
-_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB"}
 _CELLS = 1500  # of a drawn map
 
 
@@ -42,11 +43,12 @@ class TransmitterCoverage(ReceivedLevels):
         """See ``DataKind.read_problem``; the fit starts at the best place of a few random ones."""
         problems.require_sections(self, run, "[aim]")
         model, aim = radio_map(run, None), require_section(run, "aim", "a placement")
-        if model.quantity not in _UNITS:
+        if model.quantity not in LEVEL_UNITS:
             raise InputError(
-                f"map.quantity: expected {', '.join(_UNITS)} with [aim], got {model.quantity}; "
-                "choose one of these"
+                f"map.quantity: expected {', '.join(LEVEL_UNITS)} with [aim], got "
+                f"{model.quantity}; choose one of these"
             )
+        require_drawn_places(model)
         table = next((table for table in run.parameters if table.kind == "transmitter"), None)
         if table is None or len(run.parameters) > 1:
             raise InputError(
@@ -77,14 +79,12 @@ class TransmitterCoverage(ReceivedLevels):
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
         """The aim at the start and at the end, without softness."""
-        assert start.transmitter is not None
-        aim, ends = require_section(problem.run, "aim", "a placement"), []
+        run, sensor = problem.run, found.sensors[0]
         with torch.no_grad():
-            for sensor in (place_first(found.sensors[0], start.transmitter), found.sensors[0]):
-                levels = radio_map(problem.run, None).predict(found.scene, sensor, problem.run.seed)
-                ends.append(float(aim.evaluate(levels)))
-        place = start.transmitter.tolist()
-        return {"start_position": place, "aim_before": ends[0], "aim_after": ends[1]}
+            levels = radio_map(run, None).predict(found.scene, sensor, run.seed)
+        after = float(require_section(run, "aim", "a placement").evaluate(levels))
+        place, before = problem.first_sensor.sensor.positions[0], max(problem.notes["tried"])
+        return {"start_position": place.tolist(), "aim_before": before, "aim_after": after}
 
     def revise_confidence(self, fits: Fits, believed: Row) -> Row:
         """An aim has no noise: nothing to compare the map with, and no error bars."""
@@ -110,7 +110,7 @@ class TransmitterCoverage(ReceivedLevels):
 
 
 def _unit(fits: Fits) -> str:
-    return _UNITS[radio_map(fits.problem.run, None).quantity]
+    return LEVEL_UNITS[radio_map(fits.problem.run, None).quantity]
 
 
 def _describe(fits: Fits) -> str:
@@ -131,13 +131,13 @@ def _describe(fits: Fits) -> str:
 def _draw_coverage(fits: Fits) -> Any:
     """Draw the map among the receivers, at the start and where the transmitter belongs."""
     model, found = radio_map(fits.problem.run, None), fits.found.sensors[0]
-    at = model.places
+    at = require_drawn_places(model)
     if isinstance(at, ReceiverPoints):
         low, high = at.positions.amin(0), at.positions.amax(0)
         side = float((high - low)[:2].prod() / _CELLS) ** 0.5
         at = MapPlane.horizontal(low[:2], high[:2], float((low + high)[2] / 2), side)
         model = replace(model, places=ReceiverPoints(at.centres.reshape(-1, 3)))
-    ends = {"start": place_first(found, fits.start.transmitter), "placed": found}
+    ends = {"start": fits.problem.first_sensor.sensor, "placed": found}
     shown = Transmitters(torch.stack([sensor.positions[0] for sensor in ends.values()]))
     with torch.no_grad():
         levels = {

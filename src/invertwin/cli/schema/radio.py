@@ -187,7 +187,7 @@ class AimTable(Section):
             return best.mean()
         if self.measure == "worst_tenth":
             return soft_quantile(best, 0.1, softness)
-        above = best - self.level
+        above = best - (self.level or 0.0)
         return ((above / softness).sigmoid() if softness else (above > 0).double()).mean()
 
     def loss(self, levels: Tensor, before: Tensor) -> Tensor:
