@@ -32,8 +32,6 @@ from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
-LEVEL_UNITS = {"received_power": "dBm", "path_gain": "dB", "sinr": "dB"}
-"""Units of the quantities of a map that are levels."""
 _POSED = ("translation", "pose", "scale", "body", "vertices", "mover")  # kinds of parameters
 _FEW_ENDS = 2  # of other starts: fewer say nothing about how ends scatter
 

@@ -1,7 +1,7 @@
 """Placement of a transmitter: an aim of its map in place of data."""
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -10,7 +10,6 @@ from invertwin import plotting
 from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.received_levels import (
-    LEVEL_UNITS,
     ReceivedLevels,
     draw_plan,
     place_first,
@@ -34,27 +33,22 @@ _CELLS = 1500  # of a drawn map
 class TransmitterCoverage(ReceivedLevels):
     """An aim of the levels of receivers: their mean, their worst tenth, or the share covered."""
 
-    title: ClassVar[str] = "Placement of a transmitter"
-    unused: ClassVar[tuple[str, ...]] = (
-        *(*ReceivedLevels.unused, "data", "initial", "loss", "measures", "search", "starts"),
-    )
+    title = "Placement of a transmitter"
+    unused = (*ReceivedLevels.unused, "data", "initial", "loss", "measures", "search", "starts")
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; the fit starts at the best place of a few random ones."""
         problems.require_sections(self, run, "[aim]")
         model, aim = radio_map(run, None), require_section(run, "aim", "a placement")
-        if model.quantity not in LEVEL_UNITS:
-            raise InputError(
-                f"map.quantity: expected {', '.join(LEVEL_UNITS)} with [aim], got "
-                f"{model.quantity}; choose one of these"
-            )
+        if not model.unit.startswith("dB"):
+            problem = "map.quantity: expected received_power, path_gain or sinr with [aim]"
+            raise InputError(f"{problem}, got {model.quantity}; choose one of these")
         require_drawn_places(model)
         table = next((table for table in run.parameters if table.kind == "transmitter"), None)
         if table is None or len(run.parameters) > 1:
-            raise InputError(
-                'parameters: expected kind = "transmitter" alone with [aim], got '
-                f"{', '.join(table.kind for table in run.parameters)}; leave only that"
-            )
+            kinds = ", ".join(table.kind for table in run.parameters)
+            problem = 'parameters: expected kind = "transmitter" alone with [aim]'
+            raise InputError(f"{problem}, got {kinds}; leave only that")
         with prefix_errors("transmitter"):
             sensor = require_section(run, "transmitter", "[aim]").build()
         places = sensor.positions[:1]
@@ -103,26 +97,26 @@ class TransmitterCoverage(ReceivedLevels):
         drawn.append(save_picture(folder, "coverage", _draw_coverage(fits)))
         drawn.append(save_picture(folder, "loss", plotting.convergence(fits.losses)))
         aim = require_section(fits.problem.run, "aim", "a placement")
-        cells = [[aim.label(_unit(fits)), metrics["aim_before"], metrics["aim_after"]]]
+        cells = [
+            [
+                aim.label(radio_map(fits.problem.run, None).unit),
+                metrics["aim_before"],
+                metrics["aim_after"],
+            ]
+        ]
         reached = ReportTable("Aim", ["aim", "start", "placed"], cells)
         tables = [reached, error_bar_table(metrics, parameter_values(fits))]
         return Summary(metrics["answer"], quantity_table("Result", metrics), drawn, tables)
 
 
-def _unit(fits: Fits) -> str:
-    return LEVEL_UNITS[radio_map(fits.problem.run, None).quantity]
-
-
 def _describe(fits: Fits) -> str:
     """Where the transmitter belongs, and what that gains, in the units of the run file."""
-    tried, aim = (
-        fits.problem.notes["tried"],
-        require_section(fits.problem.run, "aim", "a placement"),
-    )
+    tried, run = fits.problem.notes["tried"], fits.problem.run
+    aim, unit = require_section(run, "aim", "a placement"), radio_map(run, None).unit
     after, gain = fits.best["aim_after"], fits.best["aim_after"] - fits.best["aim_before"]
-    what = f"{aim.measure.replace('_', ' ')} {after:.1f} {_unit(fits)}, {gain:+.1f} dB"
+    what = f"{aim.measure.replace('_', ' ')} {after:.1f} {unit}, {gain:+.1f} dB"
     if aim.measure == "coverage":
-        what = f"{aim.label(_unit(fits))} {100 * after:.0f} %, {100 * gain:+.0f} points"
+        what = f"{aim.label(unit)} {100 * after:.0f} %, {100 * gain:+.0f} points"
     place = format_place(fits.found.sensors[0].positions[0].tolist())
     over = f"the best of {len(tried)} random places" if len(tried) > 1 else "the start"
     return f"transmitter at ({place}) m: {what} over {over}"
@@ -145,5 +139,5 @@ def _draw_coverage(fits: Fits) -> Any:
             for title, sensor in ends.items()
         }
     maps = {title: values.view(at.shape) for title, values in levels.items()}
-    label = f"{model.quantity.replace('_', ' ')} [{_unit(fits)}]"
+    label = f"{model.quantity.replace('_', ' ')} [{model.unit}]"
     return plotting.coverage(maps, at, scene=fits.found.scene, transmitters=shown, label=label)
