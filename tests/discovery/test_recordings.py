@@ -330,3 +330,22 @@ def test_echoes_of_few_receivers_are_where_a_detector_finds_them(receivers):
     assert len(found) == 2
     for place in truth.values():
         assert min(float((place - one).norm()) for one in found) < 0.2
+
+
+def test_echoes_later_than_the_region_are_left_out(monkeypatch):
+    """A post outside the region, 2.5 m behind it, as what stands in a mirror would be."""
+    monkeypatch.setattr(ShapeSearch, "run", lambda _: [])
+    radar = around(8)
+    scene = iw.Scene({"post": thing(cylinder(0.2, 1.0), (0.0, -2.5), 0.5)})
+    grid = radar.grid(0.5, 4.6)
+    beat = iw.simulate(scene, radar, grid, seed=3, sampling=CHAIN, snr_db=10.0).beat
+    capture = Capture.from_beat(beat, radar)
+    ends = []
+    for half in (0.5, 3.0):
+        found = twin(capture, low=(-half, -half), high=(half, half), level=0.0)
+        assert found.grid is not None
+        ends.append(float(found.grid.ranges[-1]))
+    cell = CHIRP.range_resolution
+    farthest = 1.8 + 0.5 * math.sqrt(2)
+    assert farthest < ends[0] < math.hypot(farthest, HEIGHT) + 12 * cell
+    assert ends[1] > 4.0

@@ -33,6 +33,7 @@ from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.aperture import aperture
 from invertwin.scene import Scene
 
+_MARGIN_CELLS = 10  # range cells searched beyond the last echo, and beyond the region
 _LEAKAGE_CELLS = 4  # range cells with leakage from transmitters to receivers
 _DEFAULT_RADAR_HEIGHT = 0.6  # default height of radars above the ground [m]
 _FEW_CHANNELS = 4  # along an axis of the array, whose maps have no taper
@@ -109,15 +110,19 @@ def twin(
     if gains is not None:
         recording, capture = gains.apply(recording), gains.apply(capture)
     moving = _find_moving_targets(recording, range_max)
+    far = torch.cdist(places, radar.positions.detach())
     if point_detections.is_dense_track(capture):
         # Average over frames, where all of them have an echo.
-        far = torch.cdist(places, radar.positions.detach())
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         separation = 4 * max(step, radar.waveform.wavelength)
         found, image = point_detections.locate_coherent_points(capture, places, separation)
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
-    search, one = _prepare_search(capture, radar.grid(*reach), floor, places, step, rays, seed)
+    # Later echoes, such as by way of walls, are of nothing that stands in the region.
+    end = math.hypot(float(far.max()), base - floor)
+    end += _MARGIN_CELLS * radar.waveform.range_resolution
+    grid = radar.grid(reach[0], min(reach[1], end))
+    search, one = _prepare_search(capture, grid, floor, places, step, rays, seed)
     kept = None if checkpoint is None else Path(checkpoint)
     still = _find_static_objects(capture, search, one, places, kept)
     notes = () if gains is None else (_NOTES["calibration"].format(phase_spread(gains, radar)),)
@@ -317,12 +322,11 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         problem = f"expected range_max beyond the leakage, which ends at {first:.3g} m"
         raise InputError(f"{problem}, got {limit:.3g}; give a larger one")
     grid = radar.grid(first, limit)
-    power = capture.spectrum(grid).detach().double()
-    strongest, chance, note = _relate_to_noise(power, radar, grid)
+    strongest, chance, note = _relate_to_noise(capture.spectrum(grid).detach(), radar, grid)
     loud = (strongest > chance).nonzero()[:, 0]
     if not len(loud):
         return note
-    return first, min(limit, float(grid.ranges[loud[-1]]) + 10 * cell)
+    return first, min(limit, float(grid.ranges[loud[-1]]) + _MARGIN_CELLS * cell)
 
 
 def _relate_to_noise(
