@@ -96,14 +96,9 @@ class TransmitterCoverage(ReceivedLevels):
         drawn = [save_picture(folder, "plan", draw_plan(fits))]
         drawn.append(save_picture(folder, "coverage", _draw_coverage(fits)))
         drawn.append(save_picture(folder, "loss", plotting.convergence(fits.losses)))
-        aim = require_section(fits.problem.run, "aim", "a placement")
-        cells = [
-            [
-                aim.label(radio_map(fits.problem.run, None).unit),
-                metrics["aim_before"],
-                metrics["aim_after"],
-            ]
-        ]
+        run = fits.problem.run
+        label = require_section(run, "aim", "a placement").label(radio_map(run, None).unit)
+        cells = [[label, metrics["aim_before"], metrics["aim_after"]]]
         reached = ReportTable("Aim", ["aim", "start", "placed"], cells)
         tables = [reached, error_bar_table(metrics, parameter_values(fits))]
         return Summary(metrics["answer"], quantity_table("Result", metrics), drawn, tables)
