@@ -1,5 +1,6 @@
 """What surrounds a scene: ground with metres, first camera, legend, walls seen through."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,6 +126,16 @@ def test_a_closed_room_is_open_to_who_looks_from_outside():
     first, second, third = layer.points[turned].transpose(1, 0, 2)
     assert ((np.cross(second - first, third - first) * first).sum(1) < 0).all()
     assert open_walls(shown).get(shown.layers[1].name) is None
+
+
+def test_a_room_that_holds_antennas_alone_is_open_and_a_crate_before_a_radar_is_not():
+    room = Object(box([6.0, 5.0, 2.7]), RoughDielectric(4.0))
+    shown = build_display(Scene({"room": room}), {}, "title")
+    name, place = shown.layers[0].name, np.array([[1.0, 1.0, 0.5]], np.float32)
+    within = replace(shown, layers=[*shown.layers, DisplayLayer("receivers", "points", place)])
+    beyond = replace(shown, layers=[*shown.layers, DisplayLayer("boards", "points", 9 * place)])
+    assert open_walls(within).get(name) is not None
+    assert open_walls(beyond).get(name) is None
 
 
 def test_a_single_surface_is_no_wall():

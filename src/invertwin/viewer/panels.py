@@ -92,7 +92,7 @@ def _draw_axes(
     from invertwin.plotting.maps import bin_edges
 
     figure = Figure((3.2, 2.5), dpi=200)
-    axes = figure.add_axes((0.15, 0.19, 0.64, 0.7))
+    axes = figure.add_axes((0.19, 0.19, 0.6, 0.7))
     title, low, high, cmap = f"{name} [dB below peak]", MIN_LEVEL_DB, 0.0, POWER_COLORMAP
     if name == RESIDUAL:
         title, cmap = f"{MEASURED} over {SIMULATED} [dB]", RESIDUAL_COLORMAP

@@ -17,6 +17,7 @@ _USED_TANGENT = 0.85 * np.tan(_FIELD_OF_VIEW / 2)  # of its half height, and its
 _PANEL_SHARE = 0.55  # of half the height by which a phone's scene stands above the middle
 _WHOLE = 'style="display: inline-block; margin-right: 1em"'  # squares stay beside the name
 _WALL_SHARE = 0.6  # of the scene's sides that a wall spans
+_FLAT_SHARE = 0.1  # of a wall's length: its thickness
 
 
 def draw_ground(scene: Any, display: Display) -> None:
@@ -92,8 +93,9 @@ def legend_html(display: Display) -> str:
         name = roles.get(x.color, "fixed") if x.group in (*SCENE_GROUPS, "boards") else x.group
         keys.setdefault(name, {})[f'<span style="color: rgb{x.color}">■</span>'] = None
     rows = [f"<span {_WHOLE}>{''.join(own)} {escape(name)}</span>" for name, own in keys.items()]
-    hidden = "<style>#webgl-software-rendering { display: none }</style>"
-    return f'{hidden}<div style="padding: 0.3em 1em">{" ".join(rows)}</div>'
+    # On phones viser has letters of 10 pixels.
+    style = "#webgl-software-rendering { display: none } html { font-size: 14.8px !important }"
+    return f'<style>{style}</style><div style="padding: 0.3em 1em">{" ".join(rows)}</div>'
 
 
 def open_walls(display: Display) -> dict[str, NDArray[np.int32]]:
@@ -106,10 +108,14 @@ def open_walls(display: Display) -> dict[str, NDArray[np.int32]]:
     """
     low, high = display.box
     middle, found = _framed_points(display).mean(0), dict[str, NDArray[np.int32]]()
-    surfaces = [layer for layer in display.layers if layer.kind == "surface" and len(layer.points)]
-    for layer in surfaces if len(surfaces) > 1 else []:
-        is_short = np.ptp(layer.points, axis=0) < _WALL_SHARE * (high - low)
-        if layer.color == ROLES["fixed"] and is_short.sum() < 2:
+    drawn = [layer for layer in display.layers if len(layer.points)]
+    fixed = [x for x in drawn if x.kind == "surface" and x.color == ROLES["fixed"]]
+    for layer in fixed if len(drawn) > 1 else []:
+        least, most = layer.points.min(0), layer.points.max(0)
+        spans = np.linalg.svd(layer.points - layer.points.mean(0), compute_uv=False)
+        inside = (((x.points > least) & (x.points < most)).all() for x in drawn if x is not layer)
+        is_room = spans[-1] < _FLAT_SHARE * spans[0] or any(inside)
+        if is_room and (most - least < _WALL_SHARE * (high - low)).sum() < 2:
             first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
             normal = np.cross(second - first, third - first)
             turned = (normal * (middle - first)).sum(1, keepdims=True) < 0
