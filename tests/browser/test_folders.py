@@ -133,8 +133,12 @@ def test_the_viewer_of_a_folder(watched, pictures, folder, name, screen):
     with Viewer(display, links, port=0) as viewer:
         page.goto(viewer.address)
         page.wait_for_selector("canvas")
-        page.wait_for_timeout(4000)
-        png = page.screenshot(path=str(pictures / f"{name}_{screen}.png"))
+        for _ in range(10):  # a scene comes late where others use the machine, too
+            page.wait_for_timeout(2000)
+            png = page.screenshot(path=str(pictures / f"{name}_{screen}.png"))
+            if apart(png, f"{name}_{screen}") <= APART:
+                break
+        assert apart(png, f"{name}_{screen}") <= APART
         words = [(text, size, box) for text, size, *box in page.evaluate(WORDS)]
         # Ends of sliders are viser's own, and smaller.
         assert min(size for text, size, _ in words if not is_number(text)) >= 11
@@ -149,4 +153,3 @@ def test_the_viewer_of_a_folder(watched, pictures, folder, name, screen):
             )
             assert (np.abs(shown - bare) > 20).mean() > 0.001  # the ground was visible
         assert watched.errors == []
-    assert apart(png, f"{name}_{screen}") <= APART
