@@ -1,7 +1,9 @@
 """Which shapes there are: halves of a shape, other kinds, and the moves that change them."""
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
@@ -170,3 +172,31 @@ def test_a_car_is_a_vehicle():
     assert found.length == pytest.approx(long, abs=0.3)
     assert found.width == pytest.approx(wide, abs=0.2)
     assert abs(math.remainder(found.yaw - 0.6, 2 * math.pi)) < math.radians(4)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames whose likelihood of one or two shapes is known."""
+
+    gains: tuple[float, float]
+
+    def total_gain(self, shapes: Sequence[ShapeParameters]) -> float:
+        """Of one shape the first number, of two the second."""
+        return self.gains[len(shapes) - 1]
+
+    evidence = total_gain
+
+
+@pytest.mark.parametrize(
+    ("evidence", "held", "better"),
+    [(50.0, -12.0, True), (10.0, -12.0, False), (-1.0, 12.0, False), (1.0, 1.0, True)],
+)
+def test_held_out_frames_add_to_the_evidence(evidence: float, held: float, better: bool):
+    """A corner reflector that no held-out frame sees within its pattern gains 47 and loses 12."""
+    fitted: Any = Frames((0.0, evidence))
+    others: Any = Frames((0.0, held))
+    grid: Any = None
+    assert ShapeSearch(fitted, others, grid).is_better([BOX, BOX], [BOX]) == better
+    # Without held-out frames, or with fewer shapes, the evidence alone decides.
+    assert ShapeSearch(fitted, None, grid).is_better([BOX, BOX], [BOX]) == (evidence > 0)
+    assert ShapeSearch(fitted, others, grid).is_better([BOX], [BOX, BOX]) == (evidence < 0)

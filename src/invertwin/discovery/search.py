@@ -52,8 +52,11 @@ class ImageGrid:
 class ShapeSearch:
     """Search for the shapes that fit maps.
 
-    A change must raise the evidence of the fitted frames, and not lower the likelihood of held-out
-    frames.
+    A change must raise the evidence of the fitted frames; an added shape also its sum with the
+    log-likelihood of the held-out frames.
+
+    Source: Dawid, "Statistical theory: the prequential approach", 1984.
+    Differs from the source: one prediction, of all held-out frames at once, with fitted values.
 
     Attributes:
         fitted_frames: likelihood of the fitted frames.
@@ -76,15 +79,18 @@ class ShapeSearch:
     def is_better(self, new: Shapes, old: Shapes) -> bool:
         """Return whether new shapes are preferred to old ones.
 
+        The log-likelihood of held-out frames adds to the evidence of the fitted ones, as the
+        prediction of later data does. Alone it would judge by few frames, perhaps none of which
+        sees a corner reflector where its pattern holds.
+
         Args:
             new: new shapes.
             old: present shapes.
         """
-        if self.evidence(new) <= self.evidence(old):
-            return False
-        if self.held_out_frames is None or len(new) <= len(old):
-            return True
-        return self.held_out_frames.total_gain(new) > self.held_out_frames.total_gain(old)
+        gain = self.evidence(new) - self.evidence(old)
+        if gain > 0 and self.held_out_frames is not None and len(new) > len(old):
+            gain += self.held_out_frames.total_gain(new) - self.held_out_frames.total_gain(old)
+        return gain > 0
 
     @cached_property
     def first_image(self) -> Float64[Tensor, " point"]:
@@ -199,8 +205,7 @@ class ShapeSearch:
             x, y = grid.positions[index].tolist()
             corner = ShapeParameters("corner", (x, y), yaws[int(yaw[index])])
             tried = product((0.6, 1.0, 1.5), (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0))
-            high = grid.height
-            options = [replace(corner, height=k * high, brightness=b) for k, b in tried]
+            options = [replace(corner, height=k * grid.height, brightness=b) for k, b in tried]
             known = [*shapes, *found]
             new = self.select_best(known, options)
             for _ in range(2):
@@ -441,10 +446,9 @@ def rotate_headed_shapes(shapes: Shapes, rotation: float) -> list[ShapeParameter
         shapes: present shapes.
         rotation: rotation about z [rad].
     """
-    fronts = [shape.kind in ("person", "vehicle") for shape in shapes]
-    pairs = zip(shapes, fronts, strict=True)
-    rows = [rotate_shape(one, rotation) if front else one for one, front in pairs]
-    return rows if any(fronts) else []
+    headed = "person", "vehicle"
+    rows = [rotate_shape(one, rotation) if one.kind in headed else one for one in shapes]
+    return rows if any(one.kind in headed for one in shapes) else []
 
 
 def _propose_headed_shapes(shape: ShapeParameters) -> list[ShapeParameters]:
