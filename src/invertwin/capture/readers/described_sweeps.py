@@ -229,9 +229,7 @@ def _load_response(file: Path, sweep: dict[str, Any], frequencies: Tensor) -> Te
     own, response = _load_parameter(file, sweep)
     if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
         raise InputError(
-            _TEXTS["unlike_sweeps"].format(
-                len(frequencies), file.name, len(own), float(own[0]), float(own[-1])
-            )
+            _TEXTS["unlike_sweeps"].format(len(frequencies), file.name, len(own), own[0], own[-1])
         )
     return response
 
@@ -251,9 +249,7 @@ def _frequency_spacing(frequencies: _Frequencies) -> tuple[float, float]:
     """First frequency and step of equally spaced ones [Hz]."""
     count = len(frequencies)
     if count < 2:
-        raise InputError(
-            f"expected at least 2 frequencies, got {count}; ranges come from a sweep over them"
-        )
+        raise InputError(_TEXTS["few_frequencies"].format(count))
     first = float(frequencies[0])
     step = (float(frequencies[-1]) - first) / (count - 1)
     line = first + step * torch.arange(count, dtype=torch.float64)
