@@ -213,9 +213,7 @@ def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
 def _load_chirp_description(path: Path) -> tuple[dict[str, dict[str, Any]], list[int]]:
     description, axes = load_description(path, _KEYS)
     if "file" not in description.get("data", {}) or "settings" not in description:
-        raise InputError(
-            f"expected [data] with a file and [settings] in {path.name}, got none; add them"
-        )
+        raise InputError(_TEXTS["sections"].format(path.name))
     return description, axes
 
 
@@ -253,12 +251,8 @@ def load_description(
         return description, [0, 1, 2]
     places = ", ".join(sorted(_PLACES.intersection(description.get("radar", {}))))
     if places:
-        warnings.warn(
-            f"{places} in {path.name} along x left, y up, z ahead, as before version 0.4, are "
-            f"turned; write frame = {FRAME} above its sections if x is ahead, y left and z up",
-            PhysicsWarning,
-            stacklevel=2,
-        )
+        text = _TEXTS["old_frame"].format(places, path.name, FRAME)
+        warnings.warn(text, PhysicsWarning, stacklevel=2)
     return description, list(OLD_AXES)
 
 
@@ -283,9 +277,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         try:
             array = _load_file(path, ending, variable, trusted=trusted)
         except KeyError:
-            raise InputError(
-                f"expected a variable {variable!r} in {path.name}, got none; check its spelling"
-            ) from None
+            raise InputError(_TEXTS["variable"].format(variable, path.name)) from None
     if array.dtype.names is not None and len(array.dtype.names) == 2:
         # Complex numbers as MATLAB 7.3 stores them: pairs named real and imag; others r, i or I, Q.
         one, other = array.dtype.names
@@ -294,9 +286,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         wide = pairs.dtype.itemsize > 4
         array = pairs.astype("f8" if wide else "f4").view("c16" if wide else "c8")[..., 0]
     if array.dtype.kind not in "iufc":
-        raise InputError(
-            f"expected numbers in {path.name}, got {array.dtype}; name the variable of the samples"
-        )
+        raise InputError(_TEXTS["numbers"].format(path.name, array.dtype))
     if untrusted.numbers_expand(array.size, path):
         what = f"{array.size:.3g} numbers in a file of {path.stat().st_size} bytes"
         raise InputError(f"expected recorded samples in {path.name}, got {what}; copy it again")
@@ -324,13 +314,11 @@ def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) 
     Raises:
         InputError: names that do not fit.
     """
-    allowed = {*CHIRP_DIMS, "virtual", "iq"}
-    valid = isinstance(order, list) and set(order) <= allowed and len(set(order)) == len(order)
+    allowed = sorted({*CHIRP_DIMS, "virtual", "iq"})
+    valid = isinstance(order, list) and set(order) <= set(allowed) and len(set(order)) == len(order)
     both = valid and "virtual" in order and {"tx", "rx"} & set(order)
     if not valid or both or "sample" not in order or len(order) != array.ndim:
-        raise InputError(
-            _TEXTS["dimensions"].format(array.ndim, sorted(allowed), order, array.shape)
-        )
+        raise InputError(_TEXTS["dimensions"].format(array.ndim, allowed, order, array.shape))
     if "iq" in order:
         parts = np.moveaxis(array, order.index("iq"), 0)
         if len(parts) != 2 or array.dtype.kind == "c":
