@@ -79,9 +79,7 @@ class RangeInterpolator:
         """
         low, high = float(ranges.min()), float(ranges.max())
         if low < self._first - 1e-9 or high > self._last + 1e-9:
-            raise InputError(
-                _TEXTS["outside_of_profile"].format(self._first, self._last, low, high)
-            )
+            raise InputError(_TEXTS["profile_limits"].format(self._first, self._last, low, high))
         offset = ranges - self._first
         value = interpolate_samples(self._samples, offset / self._step)
         return value * torch.polar(torch.ones_like(offset), self._wavenumber * offset)
