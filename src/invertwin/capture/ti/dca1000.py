@@ -158,27 +158,17 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
     if others:
         wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
         advice = layouts.format_advice(others)
-        raise InputError(
-            _TEXTS["contradiction"].format(
-                name, wanted, size, " whose chirps break elsewhere" if exact else "", advice
-            )
-        )
+        where = " whose chirps break elsewhere" if exact else ""
+        raise InputError(_TEXTS["contradiction"].format(name, wanted, size, where, advice))
     if not exact and expected is not None and not cut:
         raise InputError(_TEXTS["size"].format(expected * frame, name, expected, frame, size))
     if not frames:
         raise InputError(_TEXTS["no_frame"].format(frame, name, size))
     missing = ""
     if rest:
-        missing = (
-            f"{name} ends within a frame: {frames} whole frames are read, 1 incomplete frame "
-            f"({rest} of {frame} bytes) is dropped; unless it was stopped there, the settings are "
-            "those of another recording"
-        )
+        missing = _TEXTS["incomplete_frame"].format(name, frames, rest, frame)
     elif expected is not None and frames < expected:
-        missing = (
-            f"{name} holds {frames} of the {expected} frames in its settings: "
-            "the recording was stopped early"
-        )
+        missing = _TEXTS["missing_frames"].format(name, frames, expected)
     if missing:
         warnings.warn(missing, PhysicsWarning, stacklevel=4)
     return frames
