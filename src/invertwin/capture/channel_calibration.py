@@ -13,7 +13,7 @@ from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.readers.radar_fields import to_data_array
 from invertwin.checks import check_shape, checked_tensor
-from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.constants import SPEED_OF_LIGHT, read_table
 from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.radar import require_sampled_waveform
@@ -21,6 +21,7 @@ from invertwin.radar.waveform import unit_window
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["channel_calibration"]
 RecordingT = TypeVar("RecordingT", bound=Capture | ChirpCapture)
 _MIN_RELATIVE_GAIN = 1e-3
 
@@ -44,18 +45,11 @@ class ChannelCalibration:
         gains = self.gains
         finite = bool(gains.numel()) and bool((gains.abs() <= MAX_NUMBER).all())
         if gains.ndim != 2 or not finite:
-            raise InputError(
-                f"expected finite gains [tx, rx], got shape {tuple(gains.shape)}; "
-                "give one complex number per virtual channel"
-            )
+            raise InputError(_TEXTS["gains"].format(tuple(gains.shape)))
         weak = gains.abs() < _MIN_RELATIVE_GAIN * gains.abs().max()
         if bool(weak.any()):
             tx, rx = (int(index) for index in weak.nonzero()[0])
-            raise InputError(
-                f"expected signal in every channel, got less than {_MIN_RELATIVE_GAIN:g} of the "
-                f"strongest from TX element {tx} to RX element {rx} (from 0); leave out the dead "
-                "element"
-            )
+            raise InputError(_TEXTS["weak_channel"].format(_MIN_RELATIVE_GAIN, tx, rx))
         gains = gains / gains.abs().square().mean().sqrt()
         total = gains.sum()
         # Phases that cancel have no common one.
@@ -135,10 +129,7 @@ def estimate_channels(
     delay = delay - radar.origin_delays[:, None, None]
     farthest = float(delay.max()) * SPEED_OF_LIGHT / 2
     if farthest >= radar.range_limits[1]:
-        raise InputError(
-            f"expected a reflector within {radar.range_limits[1]:g} m, got one at {farthest:g} m; "
-            f"{do}"
-        )
+        raise InputError(_TEXTS["reflector"].format(radar.range_limits[1], farthest, do))
     cycles = waveform.frequencies * delay[..., None]
     cycles = cycles - 0.5 * waveform.residual_slope * delay.square()[..., None]
     ideal = torch.exp(2j * torch.pi * cycles)
