@@ -9,9 +9,12 @@ from torch import Tensor
 
 from invertwin.capture.capture import BeatUnit, Capture
 from invertwin.checks import check_shape
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
+
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["chirp_capture"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +45,9 @@ class ChirpCapture:
     def __post_init__(self) -> None:
         frames, *elements = self.device.shape
         expected = (frames, self.chirps.count, *elements)
-        if not self.beat.is_complex() or tuple(self.beat.shape[:-1]) != expected:
-            raise InputError(
-                f"expected complex beat samples of shape {expected} × samples, got "
-                f"{self.beat.dtype} of {tuple(self.beat.shape)}; use the radar and the timing "
-                "that recorded them"
-            )
+        shape = tuple(self.beat.shape)
+        if not self.beat.is_complex() or shape[:-1] != expected:
+            raise InputError(_TEXTS["samples"].format(expected, self.beat.dtype, shape))
 
     def radar(self) -> Radar:
         """The radar at the poses of the frames."""
@@ -95,9 +95,7 @@ class ChirpCapture:
         """
         wrong = [number for number in numbers if not 0 <= number < self.frame_count]
         if wrong:
-            raise InputError(
-                f"expected a number below {self.frame_count}, got {wrong[0]}; count frames from 0"
-            )
+            raise InputError(_TEXTS["frame"].format(self.frame_count, wrong[0]))
         return replace(self, beat=self.beat[list(numbers)], device=self.device.frames(numbers))
 
     def with_poses(
@@ -134,16 +132,10 @@ class ChirpCapture:
         count = self.chirps.count
         if chirp == "mean":
             if self.moving:
-                raise InputError(
-                    "expected one chirp of a recording of moving targets, got the mean, in which "
-                    "they fade; choose one `chirp`, or fit a parameter of kind mover"
-                )
+                raise InputError(_TEXTS["mean"])
             beat = self.beat.mean(dim=1)
         elif isinstance(chirp, bool) or not isinstance(chirp, int) or not 0 <= chirp < count:
-            raise InputError(
-                f'expected chirps to be "mean" or a number from 0 to {count - 1}, got {chirp!r}; '
-                "say how a frame becomes one signal"
-            )
+            raise InputError(_TEXTS["chirps"].format(count - 1, chirp))
         else:
             beat = self.beat[:, chirp]
         times = None
