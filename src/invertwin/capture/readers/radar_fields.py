@@ -14,7 +14,7 @@ import xarray as xr
 from torch import Tensor
 
 from invertwin.checks import check_choice, check_shape
-from invertwin.constants import OLD_AXES
+from invertwin.constants import OLD_AXES, read_table
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
@@ -24,6 +24,7 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.isolated_reader import read_isolated
 from invertwin.storage.untrusted import convert_read_errors, existing_file
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["radar_fields"]
 WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
 }
@@ -141,10 +142,7 @@ def read_tensor(dataset: xr.Dataset, name: str) -> Tensor:
 
 def _get_entry(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> Any:
     if name not in entries:
-        raise InputError(
-            f"expected a capture with {what} {name!r}, got none; "
-            "the file is no capture or was written by another program"
-        )
+        raise InputError(_TEXTS["entry"].format(what, name))
     return entries[name]
 
 
@@ -168,10 +166,7 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
             phi: to_data_array((phi,), pattern.phi, "rad"),
             f"{end}_gain": to_data_array((theta, phi), pattern.gains, "1"),
         }, {name: "table"}
-    raise InputError(
-        f"expected a pattern Isotropic, Cosine or Table, got {type(pattern).__name__}; "
-        "sample it into a Table"
-    )
+    raise InputError(_TEXTS["pattern"].format(type(pattern).__name__))
 
 
 def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
@@ -266,10 +261,7 @@ def _join_complex(dataset: xr.Dataset) -> xr.Dataset:
         real, whole = dataset[name], name.removesuffix("_real")
         imaginary = dataset.get(f"{whole}_imag")
         if imaginary is None or imaginary.dims != real.dims:
-            raise InputError(
-                f"expected {whole}_imag beside {name} with the same shape, got none; "
-                "the file is incomplete, copy or record it again"
-            )
+            raise InputError(_TEXTS["imaginary_part"].format(whole, name))
         # Part by part: real + 1j * imaginary would lose the signs of zeros.
         values = np.empty(real.shape, dtype=f"c{2 * real.dtype.itemsize}")
         values.real, values.imag = real.values, imaginary.values
