@@ -7,8 +7,11 @@ from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.readers import described_arrays, described_sweeps
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, TxRxArrays
+
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["read"]
 
 
 def read(
@@ -50,15 +53,9 @@ def read(
         chirps = described_arrays.read_chirps(path, trusted=trusted)
         return chirps.to_chirp_capture(board or described_arrays.load_described_board(path))
     if ending not in (".bin", ".json"):
-        raise InputError(
-            "expected a recording that ends in .bin, .setup.json, .toml, .s1p, .s2p or .nc, got "
-            f"{path}; describe .npy, .npz, .h5, .hdf5 and .mat files in a .toml, convert others"
-        )
+        raise InputError(_TEXTS["ending"].format(path))
     if board is None:
-        raise InputError(
-            "expected the board that recorded, got none; name a preset of invertwin.radar.boards "
-            "as it was mounted"
-        )
+        raise InputError(_TEXTS["board"])
     return ti.read_recording(path, settings, lanes).to_chirp_capture(board)
 
 
