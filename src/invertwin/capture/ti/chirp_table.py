@@ -10,6 +10,7 @@ from invertwin.capture.chirps import ChirpSettings, shortest_loop
 from invertwin.constants import read_table
 from invertwin.errors import InputError
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["chirp_table"]
 FIELDS = read_table("invertwin.capture.ti", "fields.toml")
 """Names and places of numbers in both kinds of file."""
 # Numbers of a profile, and the power of ten of the units in which both kinds of file have them.
@@ -123,20 +124,14 @@ def frame_settings(
     defined: dict[int, tuple[int, int]] = {}
     for first, last, profile, senders, varies in chirps:
         if varies:
-            raise InputError(
-                f"expected chirps {first} to {last} as their profile, got variations; "
-                "chirps that differ are not supported"
-            )
+            raise InputError(_TEXTS["variations"].format(first, last))
         _check_numbers(first, last)
         defined |= dict.fromkeys(range(first, last + 1), (profile, senders))
     first, last, loops, frames = (int(number) for number in frame[:4])
     _check_numbers(first, last)
     order, used = _transmit_order(defined, first, last)
     if len(used) != 1 or not used <= set(profiles):
-        raise InputError(
-            f"expected one defined profile in all chirps of the frame, got {sorted(used)} of "
-            f"{sorted(profiles)}; several profiles in one frame are not supported"
-        )
+        raise InputError(_TEXTS["profiles"].format(sorted(used), sorted(profiles)))
     profile = profiles[used.pop()]
     for (name, exponent), key in zip(_PROFILE.items(), keys, strict=True):
         values[name] = scale_decimal(profile[key], exponent)
@@ -153,10 +148,7 @@ def frame_settings(
 
 def _check_numbers(first: int, last: int) -> None:
     if not 0 <= first <= last < _MAX_CHIRPS:
-        raise InputError(
-            f"expected chirps from 0 to {_MAX_CHIRPS - 1}, the first before the last, got "
-            f"{first} to {last}; correct the settings"
-        )
+        raise InputError(_TEXTS["chirps"].format(_MAX_CHIRPS - 1, first, last))
 
 
 def _transmit_order(
@@ -166,17 +158,11 @@ def _transmit_order(
     order, used = [], set()
     for chirp in range(first, last + 1):
         if chirp not in defined:
-            raise InputError(
-                f"expected chirps {first} to {last} of the frame to be defined, got none for "
-                f"{chirp}; the settings are incomplete"
-            )
+            raise InputError(_TEXTS["missing_chirp"].format(first, last, chirp))
         profile, enabled = defined[chirp]
         senders = bits_to_numbers(enabled)
         if len(senders) != 1:
-            raise InputError(
-                f"expected one transmitter per chirp (TDM), got {len(senders)} in chirp {chirp}; "
-                "chirps with several at once (BPM, beamforming, DDMA) are not supported"
-            )
+            raise InputError(_TEXTS["transmitters"].format(len(senders), chirp))
         order.append(senders[0])
         used.add(profile)
     return order, used
