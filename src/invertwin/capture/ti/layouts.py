@@ -19,8 +19,10 @@ from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
 from invertwin.capture.ti.device_limits import frame_duration
 from invertwin.checks import check_choice, checked_count
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["layouts"]
 LANE_COUNT = 4
 _MAX_WORDS = 2**17  # that are looked at
 _PREDICTION_ORDER = 6  # of the prediction of complex samples
@@ -127,16 +129,10 @@ def frame_words(settings: ChirpSettings) -> int:
 def layout_error(settings: ChirpSettings) -> str | None:
     """Return the reason why no DCA1000 records a file with these settings; None = it does."""
     if settings.lanes == LANE_COUNT and max(settings.receivers) > LANE_COUNT:
-        return (
-            f"receivers 1 to {LANE_COUNT}, one per lane, got {settings.receivers}; the DCA1000 "
-            "records one device"
-        )
+        return _TEXTS["receivers"].format(LANE_COUNT, settings.receivers)
     count = settings.samples * len(settings.receivers)
     if settings.lanes == 2 and not settings.real and count % 2:
-        return (
-            f"an even number of samples per chirp through 2 lanes, got {count}; they come in "
-            "pairs, the settings are those of another recording"
-        )
+        return _TEXTS["odd_samples"].format(count)
     return None
 
 
@@ -372,10 +368,7 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     shown = " or ".join(map(str, near[:_MAX_LISTED]))
     said = "its samples do not tell where blocks end"
     if clear:
-        said = (
-            f"prediction fails {best.border_ratio:.3g} times more at the ends of its blocks "
-            "than anywhere within"
-        )
+        said = _TEXTS["border_ratio"].format(best.border_ratio)
         if dearer < math.inf:
             said += f"; other blocks that do so cost {dearer / math.log(2):.2g} bits a word more"
     do = "correct the settings"
