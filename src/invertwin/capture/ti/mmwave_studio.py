@@ -8,9 +8,12 @@ from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti import chirp_table
+from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
+
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["mmwave_studio"]
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = chirp_table.FIELDS["studio_profile"]
@@ -64,9 +67,7 @@ def setup_files(path: str | Path) -> list[Path]:
     except (KeyError, TypeError):
         names, base = [], ""
     if not names:
-        raise InputError(
-            f"expected capturedFiles in {path.name}, got none; name the .bin files yourself"
-        )
+        raise InputError(_TEXTS["files"].format(path.name))
     return [_sibling_path(path, str(PureWindowsPath(base) / name)) for name in names]
 
 
@@ -75,9 +76,7 @@ def _load_json(path: Path) -> dict[str, Any]:
     with convert_read_errors(path, "JSON"):
         content = json.loads(whole, parse_float=Decimal)
     if not isinstance(content, dict):
-        raise InputError(
-            f"expected an object in {path}, got {type(content).__name__}; save it again"
-        )
+        raise InputError(_TEXTS["object"].format(path, type(content).__name__))
     return content
 
 
@@ -134,17 +133,11 @@ def _single_device(written: Any) -> dict[str, Any]:
     """The one device of the settings."""
     devices = _list_items(written, "rfConfig")
     if not devices:
-        raise InputError(
-            "expected settings of one device, got none; connect the device in mmWave Studio, then "
-            "save the settings again"
-        )
+        raise InputError(_TEXTS["no_device"])
     channels = [device["rfConfig"].get("rlChanCfg_t") or {} for device in devices]
     modes = [_parse_integer(own.get("cascading", 0)) for own in channels]
     if any(modes):
-        raise InputError(
-            f"expected settings of one device, got those of a cascade of {len(devices)} (cascading "
-            f"{', '.join(map(str, modes))}); its raw files are not read, give its samples as arrays"
-        )
+        raise InputError(_TEXTS["cascade"].format(len(devices), ", ".join(map(str, modes))))
     do = "name a file with the device that recorded alone; give samples of several as arrays"
     _require_equal(len(devices), 1, "settings of one device", do)
     return devices[0]
