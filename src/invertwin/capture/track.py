@@ -7,7 +7,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.checks import checked_ascending, checked_tensor
+from invertwin.constants import read_table
 from invertwin.errors import InputError
+
+_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["track"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +42,7 @@ class Track:
         first, last = float(self.times[0]), float(self.times[-1])
         asked = times.detach()
         if bool((asked < first).any()) or bool((asked > last).any()):
-            raise InputError(
-                f"expected times within the track, {first:g} to {last:g} s, got "
-                f"{float(asked.min()):g} to {float(asked.max()):g} s; check the clock offset"
-            )
+            raise InputError(_TEXTS["times"].format(first, last, *asked.aminmax()))
         after = torch.searchsorted(self.times, asked).clamp(1, len(self.times) - 1)
         start, end = self.times[after - 1], self.times[after]
         part = (times - start) / (end - start)
