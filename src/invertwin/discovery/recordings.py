@@ -110,18 +110,15 @@ def twin(
     if gains is not None:
         recording, capture = gains.apply(recording), gains.apply(capture)
     moving = _find_moving_targets(recording, range_max)
-    far = torch.cdist(places, radar.positions.detach())
     if point_detections.is_dense_track(capture):
+        far = torch.cdist(places, radar.positions.detach())
         # Average over frames, where all of them have an echo.
         places = places[(far.amin(1) > reach[0]) & (far.amax(1) < reach[1])]
         separation = 4 * max(step, radar.waveform.wavelength)
         found, image = point_detections.locate_coherent_points(capture, places, separation)
         picture = GroundImage(places[:, :2], image, _count_views(radar, places, None))
         return Twin(_sort_objects([*found, *moving]), floor, picture)
-    # Later echoes, such as by way of walls, are of nothing that stands in the region.
-    end = math.hypot(float(far.max()), base - floor)
-    end += _MARGIN_CELLS * radar.waveform.range_resolution
-    grid = radar.grid(reach[0], min(reach[1], end))
+    grid = radar.grid(reach[0], min(reach[1], _find_farthest_range(radar, places, floor)))
     search, one = _prepare_search(capture, grid, floor, places, step, rays, seed)
     kept = None if checkpoint is None else Path(checkpoint)
     still = _find_static_objects(capture, search, one, places, kept)
@@ -129,6 +126,16 @@ def twin(
     resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
     objects = _sort_objects([*resting, *moving])
     return replace(still, objects=objects, notes=(*notes, *still.notes), calibration=gains)
+
+
+def _find_farthest_range(radar: Radar, places: Tensor, floor: float) -> float:
+    """Return the range [m] beyond which echoes are of nothing that stands in a region.
+
+    Later echoes arrive by way of walls.
+    """
+    across = float(torch.cdist(places, radar.positions.detach()).max())
+    down = float(radar.positions.detach()[:, 2].mean()) - floor
+    return math.hypot(across, down) + _MARGIN_CELLS * radar.waveform.range_resolution
 
 
 def average_chirps(recording: Capture | ChirpCapture) -> Capture:
