@@ -19,6 +19,7 @@ from invertwin import __version__
 from invertwin.cli import inputs
 from invertwin.cli import options as command_options
 from invertwin.cli.options import FileArgument, ResumableOptions, argument, console, option
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, use_plain_style
 from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
@@ -240,10 +241,7 @@ def view(
     inputs.find_viewed_file(target)
     own = record is not None and os.path.realpath(record) == os.path.realpath(target)
     if record is not None and (own or (os.path.lexists(record) and not overwrite)):
-        raise InputError(
-            f"expected a new file for --record, got {record}, which exists; name another"
-            + ("" if own else ", or give --overwrite")
-        )
+        raise refusal("app.taken_record", record, "" if own else ", or give --overwrite")
     use_plain_style()
     from invertwin.cli.commands.view import run_view
 

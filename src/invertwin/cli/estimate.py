@@ -10,10 +10,10 @@ import torch
 from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.channel.sampling import resolve_densities
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.signature import count_values
-from invertwin.errors import InputError
 from invertwin.inversion import require_edge_length
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.signal.range_profile import fft_bins
@@ -91,17 +91,10 @@ class ResourceEstimate:
         free = free_memory()
         if not self.memory <= free:
             most = self.memory_items[0]
-            raise InputError(
-                f"{most.key}: expected a run within the {format_gigabytes(free)} of memory that "
-                f"are free, got an estimate of {format_gigabytes(self.memory)}, most of it for "
-                f"{min(most.count, 1e300):.3g} {most.name}; lower {most.key}, or give metres if "
-                "these are millimetres"
-            )
+            room, needed = format_gigabytes(free), format_gigabytes(self.memory)
+            raise refusal("estimate.memory", most, room, needed, min(most.count, 1e300))
         if not self.ray_count <= _MAX_RAYS:
-            raise InputError(
-                f"{self.rays_key}: expected at most {_MAX_RAYS:g} rays in all, got "
-                f"{min(self.ray_count, 1e300):.3g}; lower {self.rays_key}"
-            )
+            raise refusal("estimate.rays", self.rays_key, _MAX_RAYS, min(self.ray_count, 1e300))
 
 
 @dataclass(frozen=True)

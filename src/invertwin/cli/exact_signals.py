@@ -6,10 +6,11 @@ from typing import Any
 import torch
 
 from invertwin.channel import Grid, Sampling
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
-from invertwin.errors import InputError, PhysicsWarning
+from invertwin.errors import PhysicsWarning
 from invertwin.radar import Chirps, Radar
 from invertwin.scene import MovingScene, Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
@@ -64,8 +65,7 @@ def warn_if_aliased(moving: Scene | MovingScene, radar: Radar, chirps: Chirps) -
     with torch.no_grad():
         fastest = max(float((distances(t + loop) - distances(t)).abs().max()) for t in starts)
     if fastest > limit * loop:
-        text = f"chirps: what moves has range rates up to {fastest / loop:.2f} m/s, beyond "
-        text += f"{limit:.2f} m/s, and appears at others; shorten the interval of chirps"
+        text = refusal_text("exact_signals.aliases", fastest / loop, limit)
         warnings.warn(text, PhysicsWarning, stacklevel=2)
 
 
@@ -77,10 +77,7 @@ def require_simulated_data(run: RunFile) -> SimulatedData:
     """
     data = require_section(run, "data", "a simulation")
     if not isinstance(data, SimulatedData):
-        raise InputError(
-            f'data.kind: expected "simulated" to simulate a scene, got "{data.kind}"; '
-            "give density and snr_db instead of a capture"
-        )
+        raise refusal("exact_signals.measured_data", data.kind)
     return data
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from invertwin.cli.options import RecordingOptions
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.registry.kinds import load_plugins
@@ -59,10 +60,7 @@ def find_plugin_recording(path: Path) -> tuple[Path, str, str | None]:
     for file, (kind, board) in known.items():
         if (folder / file).is_file() and path.name in (file, folder.name):
             return folder, kind, board
-    raise InputError(
-        f"expected a folder with {' or '.join(known) or 'a recording that a plugin reads'}, got "
-        f"{path}; name the file, and of other arrays the TOML description"
-    )
+    raise refusal("inputs.folder", " or ".join(known) or "a recording that a plugin reads", path)
 
 
 def _recording_faults(options: RecordingOptions) -> Iterator[str]:
@@ -71,13 +69,11 @@ def _recording_faults(options: RecordingOptions) -> Iterator[str]:
     if ending == ".bin" and options.config is None:
         yield "expected --config, got none; name the .cfg or .mmwave.json that it was set up with"
     if name not in boards and (raw or name is not None):
-        do = "name the preset that recorded, and its --elevation"
-        yield f"expected a --board of {', '.join(boards)}, got {name or 'none'}; {do}"
+        yield refusal_text("inputs.unknown_board", ", ".join(boards), name or "none")
     elif name is not None and raw and options.elevation is None:
         ends = (boards[name]["transmitters"], boards[name]["receivers"])
         if any(len({row for _, row in end}) > 1 for end in ends):
-            do = "1 if its rows grow upwards: a reflector above the board must be at v > 0"
-            yield f"expected --elevation 1 or -1 for {name}, got none; give {do}"
+            yield refusal_text("inputs.no_elevation", name)
 
 
 def find_viewed_file(target: Path) -> Path:
@@ -93,13 +89,7 @@ def find_viewed_file(target: Path) -> Path:
         for name in _VIEWED:
             if (target / name).is_file():
                 return target / name
-        raise InputError(
-            f"expected a run folder with {', '.join(_VIEWED)}, got {target} without any; name a "
-            "folder of invertwin reconstruct, simulate, look or twin, a run file, or a capture"
-        )
+        raise refusal("inputs.empty_folder", ", ".join(_VIEWED), target)
     if target.suffix not in (".toml", ".nc"):
-        raise InputError(
-            f"expected a run folder, a run file (.toml) or a capture (.nc), got {target}; read "
-            "other recordings with invertwin look, which writes a capture"
-        )
+        raise refusal("inputs.other_file", target)
     return existing_file(target, "a run file or a capture")

@@ -17,6 +17,7 @@ import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.report import load_texts
 from invertwin.constants import FRAME, read_table
 from invertwin.errors import InputError
@@ -101,10 +102,7 @@ def validate_run(raw: dict[str, Any], source: Path) -> Any:
         InputError: It does not fit the schema, or states no frame.
     """
     if "task" in raw and "frame" not in raw:
-        raise InputError(
-            f"{source}: expected frame = {FRAME} (x ahead, y to the left, z up), got one of the "
-            f"first frame, which had none; convert it: invertwin convert {quote(str(source))}"
-        )
+        raise refusal("run_file.first_frame", source, FRAME, quote(str(source)))
     try:
         from invertwin.cli.schema import RunFile
 
@@ -143,10 +141,8 @@ def to_minimal_toml(run: Any) -> str:
 
 def unknown_object_message(path: str, name: str, known: Sequence[str]) -> str:
     """Return the message for a key that names an object which the scene does not have."""
-    return (
-        f"{path}: expected the name of an object of the scene ({', '.join(known)}), "
-        f"got {_format_value(name)}; " + suggest_name(name, known, "add it to the scene")
-    )
+    advice = suggest_name(name, known, "add it to the scene")
+    return refusal_text("run_file.object", path, ", ".join(known), _format_value(name), advice)
 
 
 def _syntax_error_message(path: Path, text: str, message: str) -> str:
@@ -155,10 +151,8 @@ def _syntax_error_message(path: Path, text: str, message: str) -> str:
     number = int(place[1]) if place else len(lines)
     reason = message[: place.start()] if place else message
     line = lines[min(number, len(lines)) - 1].strip()
-    return (
-        f"{path}: line {number}: expected TOML, got {_format_value(line)} "
-        f"({' '.join(reason.split())}); correct that line"
-    )
+    reason = " ".join(reason.split())
+    return refusal_text("run_file.syntax", path, number, _format_value(line), reason)
 
 
 def _explain_error(error: ErrorDetails) -> str:

@@ -12,12 +12,12 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import load_rcs
 from invertwin.cli.estimate import estimate_rcs_resources
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
 from invertwin.cli.terminal import RunBatch
-from invertwin.errors import InputError
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, to_dbsm
 from invertwin.storage.run_folder import RunFolder
@@ -106,9 +106,7 @@ def _case_error(table: RcsTable, name: str, found: Signature) -> float:
     case = table.cases[name]
     with prefix_errors(f"rcs.cases.{name}"):
         if case.part is not None and case.part not in found.parts:
-            raise InputError(
-                f"expected a part ({', '.join(found.parts)}), got {case.part}; choose one", "part"
-            )
+            raise refusal("rcs.unknown_part", ", ".join(found.parts), case.part, at="part")
         oracle = case.reference.build()
     whole = found.matrix if case.part is None else found.parts[case.part]
     i, j = table.channels[case.channel]
@@ -128,11 +126,7 @@ def _match_measurement(
     other, frequency = (data.frequency[:, None] / found.frequencies - 1).abs().min(1)
     same = (off < _MATCH_TOLERANCE) & (other < _MATCH_TOLERANCE)
     if not bool(same.any()):
-        raise InputError(
-            f"expected rows of swept angles and frequencies, got none of {len(same)} in "
-            f"{measurement.file}; sweep its angles",
-            "file",
-        )
+        raise refusal("rcs.unswept_rows", len(same), measurement.file, at="file")
     stated = measurement.channel
     channel, letter = table.channels[stated], stated[0] if len(set(stated)) == 1 else stated
     keys: dict[str, _MeasuredRows] = {}
@@ -200,9 +194,7 @@ def _image_axes(found: Signature) -> tuple[Tensor, Tensor]:
     across = found.directions[-1] - found.directions[0]
     across = across - (across @ middle) * middle
     if float(across.norm()) < _MATCH_TOLERANCE:
-        raise InputError(
-            "expected several aspects for an image, got one direction; sweep an angle", "rcs.image"
-        )
+        raise refusal("rcs.one_aspect", at="rcs.image")
     return middle, across / across.norm()
 
 
