@@ -12,6 +12,7 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.estimate import SensorSetup, estimate_rcs_resources, require_resources
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
@@ -165,10 +166,7 @@ def _radio_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _
     places = model.places
     drawn = isinstance(places, MapPlane | ReceiverPoints)
     if not drawn or len(sensor.positions) > 1 or model.quantity != "gain":
-        raise InputError(
-            'map: expected quantity = "gain", places of kind "points" or "plane" and one '
-            "transmitter, got others; gradient checks compare and draw these"
-        )
+        raise refusal("gradcheck.undrawn_map")
     label = f"∂ gain [peaks, {_derivative_unit(settings)}]"
 
     def draw(report: GradientReport) -> Figure:
@@ -201,10 +199,7 @@ def _image_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _Grad
 def _radar_map_target(run: RunFile, settings: GradcheckTable, scene: Scene) -> _GradcheckTarget:
     """The smooth map of `[radar]`, `[grid]` and `[surrogate]`."""
     if run.surrogate.exact:
-        raise InputError(
-            "surrogate.exact: expected a smooth map to differentiate, got exact signals; remove "
-            "it: silhouettes of single rough points have no derivative"
-        )
+        raise refusal("gradcheck.exact_signals")
     radar = build.radar(require_section(run, "radar", "gradcheck"))
     grid = build.grid(require_section(run, "grid", "gradcheck"), radar)
     require_resources(run, scene, {"": SensorSetup(run, radar, grid)})
@@ -249,9 +244,7 @@ def _run_check(
         if seen.device is None:
             raise InputError(f"{key}: expected [radar] and [grid] with it, got none; remove it")
         if settings.parameter.kind not in _FIXED_TRIANGLE_KINDS:
-            raise InputError(
-                f"{key}: expected a parameter that moves something, got one of a shape; remove it"
-            )
+            raise refusal("gradcheck.shape_parameter", key)
     check = settings.build()
     radar = seen.device[0] if seen.device else None
     report = gradcheck(

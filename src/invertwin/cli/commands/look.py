@@ -18,6 +18,7 @@ from invertwin.checks import checked_number
 from invertwin.cli import report
 from invertwin.cli.inputs import find_plugin_recording
 from invertwin.cli.options import LookOptions, RecordingOptions
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import MapPanel
@@ -180,9 +181,7 @@ def read_recording(options: RecordingOptions) -> tuple[str, AnyRecording]:
         board = _mount_board(options, options.board or "")
     if options.change:
         if not raw:
-            raise InputError(
-                f"expected --set with a .bin or .setup.json, got {path.name}; correct its own file"
-            )
+            raise refusal("look.change_of_other_file", path.name)
         known = captures.ti.read_settings(options.config or path)
         settings = captures.ti.change_settings(known, _parse_changes(options.change))
     found = captures.read(path, settings, board=board, lanes=options.lanes)
@@ -199,10 +198,7 @@ def _parse_changes(given: list[str]) -> dict[str, Any]:
             if not isinstance(number, int | float):
                 raise ValueError
         except (ValueError, RecursionError):  # also of thousands of digits or levels
-            raise InputError(
-                f"expected --set NAME=NUMBER, such as samples=128, or real=true, got "
-                f"{text[:60]!r}; write it so"
-            ) from None
+            raise refusal("look.change", text[:60]) from None
     return found
 
 
@@ -247,10 +243,7 @@ def _make_grid(options: LookOptions, capture: captures.Capture, recording: AnyRe
     else:
         low, high = captures.search_ranges(recording, options.range_min, options.range_max)
     if high > farthest * (1 + 1e-9):
-        raise InputError(
-            f"expected a --range-max within {farthest:.4g} m, got {high:g}; samples "
-            "do not tell ranges beyond it"
-        )
+        raise refusal("look.far_range", farthest, high)
     if profiles:
         step = cell / 2  # inside the first and last samples
         return Grid(low, step, max(int((high - low) / step), 1))
@@ -266,9 +259,7 @@ def _high_resolution_panels(
     """Draw direction spectra by a method other than Bartlett's."""
     radar = capture.radar()
     if "range_profile" in capture.dataset:
-        raise InputError(
-            f"expected --method bartlett, got {options.method}; this recording has one channel"
-        )
+        raise refusal("look.method", options.method)
     if chirps is None:
         one = capture.frames([options.frame])
         profile = radars.range_profile(one.beat, one.radar(), grid)

@@ -11,11 +11,11 @@ from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import Problem, make_observations, make_unknowns, stage_runs
 from invertwin.cli.fits.radar_models import with_new_recording
 from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, load_texts, write_report
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
 from invertwin.cli.terminal import limit_rate, show_progress
-from invertwin.errors import InputError
 from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.inversion.confidence.planning import fit_errors
 from invertwin.inversion.confidence.report import error_bar_metrics
@@ -34,10 +34,7 @@ def run_plan(run: RunFile, folder: RunFolder, console: Console) -> tuple[list[Re
     begin, table = time.perf_counter(), run.plan or PlanTable()
     for own in [run, *run.observations.values()]:
         if own.data is not None and not isinstance(own.data, SimulatedData):
-            raise InputError(
-                f'data.kind: expected "simulated" for a plan, got "{own.data.kind}"; a plan comes '
-                "before the recording: give [radar] and the noise of [data]"
-            )
+            raise refusal("plan.measured_data", own.data.kind)
     wide, places = run, torch.zeros(0, 3)
     if table.candidates is not None:
         radar = require_section(run, "radar", "positions to add")

@@ -21,11 +21,11 @@ from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
 from invertwin.cli.fits.writing import state_positions
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, ReportView, save_picture, write_report
 from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.terminal import show_progress
-from invertwin.errors import InputError
 from invertwin.inversion.confidence.report import confidence_metrics
 from invertwin.inversion.fit import Fit
 from invertwin.scene.files import save_mesh
@@ -59,9 +59,7 @@ def run_reconstruct(
         InputError: A wrong run file, workers where there is one fit, or a view of their fits.
     """
     if view and workers is not None:
-        raise InputError(
-            "expected --view with fits in this process, got --workers or --engine; leave one out"
-        )
+        raise refusal("reconstruct.view_of_workers")
     begin = time.perf_counter()
     problem = build_problem(run, console)
     problem = problem.kind.prepare(problem, folder, console)

@@ -20,10 +20,10 @@ from invertwin.cli import report
 from invertwin.cli.commands.look import describe_frame, describe_peak, draw_spectrogram
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RawTable, RunFile, build
-from invertwin.errors import InputError
 from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps
 from invertwin.radar.processing.doppler_maps import find_peak
@@ -132,25 +132,16 @@ def make_chirp_settings(run: RunFile, radar: Radar) -> ChirpSettings:
             do not fit their interval.
     """
     if not isinstance(radar.waveform, FMCW):
-        raise InputError(
-            f'raw: expected radar.waveform.kind = "fmcw", got {type(radar.waveform).__name__}; '
-            "raw files are those of FMCW boards: remove [raw]"
-        )
+        raise refusal("simulate.other_waveform", type(radar.waveform).__name__)
     raw = run.raw or RawTable()
     ramp = raw.adc_start_time + radar.waveform.duration
     idle = _IDLE_TIME
     if run.chirps is not None:
         if not run.chirps.tdm:
-            raise InputError(
-                "raw: expected transmitters that take turns, got chirps.tdm = false; "
-                "raw files of transmitters that send at once cannot be separated"
-            )
+            raise refusal("simulate.simultaneous")
         idle = run.chirps.interval - ramp
         if idle < -1e-12:
-            raise InputError(
-                f"chirps.interval: expected at least the ramp's {ramp:g} s, got "
-                f"{run.chirps.interval:g}; idle time comes on top"
-            )
+            raise refusal("simulate.short_interval", ramp, run.chirps.interval)
     board = None if run.radar is None else run.radar.board
     with prefix_errors("raw"):
         settings = make_settings(
