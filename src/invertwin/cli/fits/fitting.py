@@ -17,6 +17,7 @@ from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import Fits, Problem, Row, Start
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import format_place
 from invertwin.cli.schema import build
 from invertwin.discovery.imaging.point_detections import find_image_peak
@@ -304,9 +305,7 @@ def calibrate_problem(problem: Problem, folder: RunFolder, console: Console) -> 
     if table is None:
         return problem
     if len(problem.sensor_data) > 1:
-        raise InputError(
-            "calibration: expected one sensor, got several; calibrate each recording by itself"
-        )
+        raise refusal("fitting.several_sensors")
     item, target = problem.first_sensor, problem.truth[table.object]
     capture, row = item.recording, {}
     if table.method == "backprojection":

@@ -8,10 +8,10 @@ from invertwin.cli.fits.problem import DataKind, Problem
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.received_levels import ReceivedLevels
 from invertwin.cli.fits.transmitter_coverage import TransmitterCoverage
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
-from invertwin.errors import InputError
 
 _MADE_FROM_DATA = ("transmitter", "panel", "panel_phases", "mover")  # parameters that need them
 
@@ -43,10 +43,7 @@ def build_problem(run: RunFile, console: Console) -> Problem:
     kind, scene, truth = kind_of(run), build.scene(run), build.true_scene(run)
     for i, parameter in enumerate(run.parameters):
         if parameter.kind == "mover" and not isinstance(kind, MovingTarget):
-            raise InputError(
-                f"parameters[{i}].kind: expected kind mover as the only parameter, got "
-                f"{len(run.parameters)} parameters; leave only that"
-            )
+            raise refusal("kinds.other_parameters", i, len(run.parameters))
     # Their errors come before any work.
     _try_parameters(run, run)
     for name, variant in run.variants.items():

@@ -20,6 +20,7 @@ from invertwin.cli.exact_signals import simulate_chirp_beats
 from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import scene_at_start
@@ -173,10 +174,7 @@ def _read_recording(run: RunFile, truth: Scene) -> ChirpCapture:
     else:
         recording = build_chirp_capture(data)
     if recording.device.frame_count > 1:
-        raise InputError(
-            f"data: expected one frame with a mover, got {recording.device.frame_count}; "
-            "choose one with `frame`"
-        )
+        raise refusal("moving_target.several_frames", recording.device.frame_count)
     return recording
 
 

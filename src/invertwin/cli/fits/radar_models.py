@@ -13,6 +13,7 @@ from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli.estimate import SensorSetup
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.fits.problem import Problem, SensorData, about_sensor, sensor_runs, stage_runs
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
 from invertwin.cli.schema.recordings import DEFAULT_POINTS_PER_M2, build_capture
@@ -44,10 +45,7 @@ def _sensor(run: RunFile) -> SensorSetup:
         radar = build.radar(require_section(run, "radar", "simulated data"))
         return SensorSetup(run, radar, build.grid(table, radar))
     if run.radar is not None:
-        raise InputError(
-            f"radar: expected no [radar] with data.kind = {data.kind}, got one; "
-            "remove it: a capture brings its radar along"
-        )
+        raise refusal("radar_models.second_radar", data.kind)
     capture = build_capture(data)
     radar = capture.radar()
     return SensorSetup(run, radar, build.grid(table, radar), capture)
@@ -104,12 +102,8 @@ def warn_if_depths_differ(run: RunFile, sensors: Mapping[str, SensorSetup]) -> N
         data, depth = sensor.run.data, run.fit_settings.depth
         if isinstance(data, SimulatedData) and data.depth != depth and run.chirps is None:
             at = f"observations.{name}." if name else ""
-            warnings.warn(
-                f"reconstruct.depth is {depth}, {at}data.depth is {data.depth}: the fit models "
-                "echoes of other numbers of bounces than its data have; make them equal",
-                PhysicsWarning,
-                stacklevel=4,
-            )
+            text = refusal_text("radar_models.depths", depth, at, data.depth)
+            warnings.warn(text, PhysicsWarning, stacklevel=4)
 
 
 def has_recording_per_start(run: RunFile) -> bool:
@@ -192,9 +186,7 @@ def estimate_initial_scene(problem: Problem, console: Console) -> Problem:
     if table is None:
         return problem
     if run.starts is not None:
-        raise InputError(
-            "initial: expected no [starts] beside [initial], got both; a fit starts from one"
-        )
+        raise refusal("radar_models.two_starts")
     with prefix_errors("initial"):
         name = table.object
         if name is None:

@@ -17,6 +17,7 @@ from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table, score_fit
 from invertwin.cli.fits.writing import describe_outcome, parameter_values
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
@@ -57,17 +58,11 @@ class ReceivedLevels(DataKind):
             with prefix_errors("data"):
                 points, levels = data.read()
             if len(levels) != len(sensor.positions):
-                raise InputError(
-                    f"data.file: expected a column of levels for each of {len(sensor.positions)} "
-                    f"transmitters, got {len(levels)}; see [transmitter]"
-                )
+                raise refusal("received_levels.columns", len(sensor.positions), len(levels))
             item = SensorData((levels, points), sensor)
             return Problem(run, scene, truth, frozenset(run.truth), {"": item}, target, self)
         if not isinstance(data, ReceivedData):
-            raise InputError(
-                "data.kind: expected received or received_file with [map], got "
-                f"{data.kind}; choose one"
-            )
+            raise refusal("received_levels.other_data", data.kind)
         with prefix_errors("data"):
             real = sensor if data.positions is None else _with_positions(sensor, data.positions)
         console.print("simulating the levels of the true scene")
@@ -88,10 +83,7 @@ class ReceivedLevels(DataKind):
             return problem
         with prefix_errors("initial"):
             if table.object is not None or problem.run.transmitter_starts is not None:
-                raise InputError(
-                    "expected the first transmitter alone with [map], without object and "
-                    "[transmitter_starts], got more; remove it"
-                )
+                raise refusal("received_levels.other_initial")
             box = table.build()
         item = problem.first_sensor
         position = _power_centroid(problem, (box.low, box.high))
@@ -223,11 +215,7 @@ def has_transmitter(run: RunFile) -> bool:
 def _with_positions(sensor: Transmitters, positions: Sequence[Sequence[float]]) -> Transmitters:
     places = torch.tensor(positions, dtype=torch.float64)
     if places.shape != sensor.positions.shape:
-        raise InputError(
-            f"expected {len(sensor.positions)} positions, got {len(places)}; give one for each "
-            "transmitter",
-            "positions",
-        )
+        raise refusal("received_levels.places", len(sensor.positions), len(places), at="positions")
     return replace(sensor, positions=places)
 
 

@@ -15,10 +15,11 @@ from pathlib import Path
 
 from rich.console import Console
 
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile
 from invertwin.cli.terminal import show_progress
-from invertwin.errors import InputError, PhysicsWarning
+from invertwin.errors import PhysicsWarning
 from invertwin.runtime.engines import Engine, run_jobs
 from invertwin.runtime.progress import track
 from invertwin.storage.folders import PARTS, UNFINISHED
@@ -74,10 +75,7 @@ def distribute_fits(
         InputError: What a fit refuses, or only one fit.
     """
     if len(fits) == 1:
-        raise InputError(
-            "expected several starts or variants for --engine ray or --workers, got one fit; leave "
-            "the option out"
-        )
+        raise refusal("spreading.one_fit")
     text, begun = to_minimal_toml(run), f"{PARTS}/calibration.pt"
     path = folder.path / UNFINISHED / begun
     files = {begun: path.read_bytes()} if path.is_file() else {}

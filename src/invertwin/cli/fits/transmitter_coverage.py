@@ -18,10 +18,10 @@ from invertwin.cli.fits.received_levels import (
 )
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.writing import parameter_values
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
-from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.scene import Scene
@@ -41,14 +41,12 @@ class TransmitterCoverage(ReceivedLevels):
         problems.require_sections(self, run, "[aim]")
         model, aim = radio_map(run, None), require_section(run, "aim", "a placement")
         if not model.unit.startswith("dB"):
-            problem = "map.quantity: expected received_power, path_gain or sinr with [aim]"
-            raise InputError(f"{problem}, got {model.quantity}; choose one of these")
+            raise refusal("transmitter_coverage.quantity", model.quantity)
         require_drawn_places(model)
         table = next((table for table in run.parameters if table.kind == "transmitter"), None)
         if table is None or len(run.parameters) > 1:
             kinds = ", ".join(table.kind for table in run.parameters)
-            problem = 'parameters: expected kind = "transmitter" alone with [aim]'
-            raise InputError(f"{problem}, got {kinds}; leave only that")
+            raise refusal("transmitter_coverage.other_parameters", kinds)
         with prefix_errors("transmitter"):
             sensor = require_section(run, "transmitter", "[aim]").build()
         places = sensor.positions[:1]
