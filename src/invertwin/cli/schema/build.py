@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section, unknown_object_message
 from invertwin.cli.schema import RunFile, SceneFileTable
 from invertwin.cli.schema.sensors import grid as grid
@@ -50,10 +51,7 @@ def scene(run: RunFile) -> Scene:
 
 def _require_new(name: str, built: Mapping[str, Object]) -> None:
     if name in built:
-        raise InputError(
-            f'expected names that differ from those of the scene file and the room, got "{name}" '
-            "twice; choose another"
-        )
+        raise refusal("build.taken_name", name)
 
 
 def true_scene(run: RunFile) -> Scene:
@@ -71,10 +69,7 @@ def true_scene(run: RunFile) -> Scene:
                 # where it puts them. Furniture has one, which stays where no other is stated.
                 made_of, item = changes.pop("material", None), found[name]
                 if "angles_deg" in changes:
-                    raise InputError(
-                        f"expected angles_deg of a body of [scene.{name}], got them for a thing of "
-                        "a file or a room; remove them"
-                    )
+                    raise refusal("build.angles_of_a_mesh", name)
                 if (velocity := changes.pop("velocity", None)) is not None:
                     item = replace(item, velocity=torch.tensor(velocity, dtype=torch.float64))
                 changes.setdefault("position", item.transform[:3, 3].tolist())

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import MinLen
 from pydantic import model_validator
 
+from invertwin.cli.refusals import refusal_text
 from invertwin.cli.schema.variation import parse_key_path
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.limits import Count
@@ -57,11 +58,8 @@ class VaryTable(ConstructorTable):
         for path in self.paths:
             steps = parse_key_path(path)
             if not steps or steps[0] in _DATASET_SECTIONS:
-                raise_key_error(
-                    f"expected a path such as scene.box.position[0], and none of "
-                    f'{", ".join(_DATASET_SECTIONS)}, got "{path}"; correct it',
-                    "key",
-                )
+                text = refusal_text("dataset.other_path", ", ".join(_DATASET_SECTIONS), path)
+                raise_key_error(text, "key")
         return self
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import GetCoreSchemaHandler, model_validator
 
+from invertwin.cli.refusals import refusal_text
 from invertwin.inversion import GaussianBump, GradcheckSettings
 from invertwin.limits import Count, Positive
 from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list, registry
@@ -62,9 +63,7 @@ class GradcheckTable(ConstructorTable):
     @model_validator(mode="after")
     def _require_step(self) -> "GradcheckTable":
         if self.parameter.kind == "mover":
-            raise_key_error(
-                "expected a parameter of the scene or the radar, got kind mover; choose another"
-            )
+            raise_key_error(refusal_text("gradcheck.mover_parameter"))
         wanted = {"step_deg": self.changes_angle, "step": not self.changes_angle}
         check_presence(self, wanted, f"with kind = {self.parameter.kind}")
         return self

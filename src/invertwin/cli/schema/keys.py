@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable
-from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.registry.kinds import PLUGINS
 from invertwin.registry.section import suggest_name
@@ -83,10 +83,9 @@ def key_tables(section: str) -> list[ReportTable]:
     names = [name for name in found if f"{_plain_path(name)}.".startswith(f"{wanted}.")]
     if not names:
         known = [_plain_path(name) for name in found if name]
-        raise InputError(
-            f"expected a section ({', '.join(n for n in known if '.' not in n)}), "
-            f"got {section}; {suggest_name(wanted, known, 'choose one', 0.6)}"
-        )
+        choice = ", ".join(n for n in known if "." not in n)
+        advice = suggest_name(wanted, known, "choose one", 0.6)
+        raise refusal("keys.unknown_section", choice, section, advice)
     return [table for name in names for table in found[name]]
 
 

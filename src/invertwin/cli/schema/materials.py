@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
 
 from invertwin import scene
-from invertwin.errors import InputError
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, ValueFormat
 from invertwin.registry.section import InputPath, Section, raise_key_error
 from invertwin.scene.material.materials import Medium
@@ -53,9 +53,7 @@ class MediumTable(ConstructorTable):
     @model_validator(mode="after")
     def _require_permittivity(self) -> "MediumTable":
         if self.itu is None and getattr(self, "permittivity", None) is None:
-            raise_key_error(
-                "expected `permittivity`, or `itu` with a name of its table, got neither; add one"
-            )
+            raise_key_error(refusal_text("materials.no_permittivity"))
         return self
 
     def library_values(self, given: Mapping[type, object]) -> dict[str, Any]:
@@ -89,9 +87,6 @@ def _build_value(value: Any, name: str, angle: bool, given: Mapping[type, object
         return math.radians(value) if angle else value
     mesh = given.get(scene.Mesh)
     if not isinstance(mesh, scene.Mesh):
-        raise InputError(
-            f"expected {name} as a number for the materials of a scene file, got an image; "
-            "give textures to objects of their own"
-        )
+        raise refusal("materials.texture", name)
     texture = scene.Texture.from_projection(read_npy(value.image), mesh)
     return replace(texture, image=torch.deg2rad(texture.image)) if angle else texture

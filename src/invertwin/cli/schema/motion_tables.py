@@ -2,10 +2,10 @@
 
 from torch import Tensor
 
+from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.shape_tables import ObjectTable, joint_positions, require_body
-from invertwin.errors import InputError
 from invertwin.scene import BodyTemplate, MovingScene, ObjectMotion, Scene, Waving
 from invertwin.scene.people.gait import PersonMotion
 
@@ -73,9 +73,7 @@ def refuse_motion(run: RunFile) -> None:
     for name, table in run.scene.items():
         if table.motion:
             with prefix_errors(f"scene.{name}.motion"):
-                raise InputError(
-                    "expected a section [chirps] with it, got none; add it, or remove the motion"
-                )
+                raise refusal("motion_tables.motion_without_chirps")
 
 
 def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
@@ -90,9 +88,7 @@ def _build_motions(table: ObjectTable) -> list[ObjectMotion]:
             postures = [mover for mover in found if isinstance(mover, PersonMotion)]
             earlier = [] if row.kind == "breathing" else postures
             if earlier and (row.kind != "waving" or isinstance(earlier[0], Waving)):
-                raise InputError(
-                    "expected one motion of a person, or waving after another, got two; remove one"
-                )
+                raise refusal("motion_tables.two_motions")
             given: dict[type, object] = {type(mover): mover for mover in earlier}
             got = "another; give it this shape, or choose another motion"
             body = earlier[0].body if earlier else require_body(table, got)

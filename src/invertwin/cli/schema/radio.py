@@ -7,9 +7,9 @@ from annotated_types import MinLen
 from pydantic import model_validator
 from torch import Tensor
 
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.schema.fits import SamplingBase
 from invertwin.cli.schema.sensors import Orientation, PolarisationValue
-from invertwin.errors import InputError
 from invertwin.limits import Count, NonNegative
 from invertwin.links import AntennaMount, PropagationSettings, Transmitters
 from invertwin.links.metasurface.coverage import soft_quantile
@@ -138,10 +138,7 @@ class TransmitterStartsTable(Section):
                 found.append(place)
             if len(found) == self.count:
                 return torch.cat(found)
-        raise InputError(
-            f"expected room for {self.count} starts in the box, found {len(found)}; widen the box, "
-            "or lower `clear`"
-        )
+        raise refusal("radio.no_room", self.count, len(found))
 
 
 class AimTable(Section):
@@ -161,8 +158,7 @@ class AimTable(Section):
         if self.measure == "coverage" and self.level is None:
             raise_key_error('expected a level with "coverage", got none; add it', "level")
         if self.measure != "coverage" and self.level is not None:
-            got = f'expected none with "{self.measure}", got {self.level:g}; remove it'
-            raise_key_error(f'{got}, or write measure = "coverage"', "level")
+            raise_key_error(refusal_text("radio.unused_level", self.measure, self.level), "level")
         return self
 
     def label(self, unit: str) -> str:

@@ -9,8 +9,8 @@ from pydantic import model_validator
 from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
 from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.capture.readers.radar_fields import WAVEFORMS
+from invertwin.cli.refusals import refusal
 from invertwin.cli.schema.sensors import RadarPoseTable
-from invertwin.errors import InputError
 from invertwin.limits import Count, Decibels, Positive
 from invertwin.radar.boards import Mounting
 from invertwin.registry import section
@@ -197,8 +197,5 @@ def build_chirp_capture(data: Any) -> ChirpCapture:
     with prefix_errors("data"):
         found = None if data.kind == "simulated" else data.build()
     if not isinstance(found, ChirpCapture):
-        raise InputError(
-            f'data.kind: expected data with chirps, got "{data.kind}"; give dca1000, arrays, or '
-            "simulated with [chirps]"
-        )
+        raise refusal("recordings.no_chirps", data.kind)
     return found

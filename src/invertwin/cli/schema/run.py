@@ -10,6 +10,7 @@ from pydantic import Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
+from invertwin.cli.refusals import refusal_text
 from invertwin.cli.schema import fits
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
@@ -266,38 +267,27 @@ class _RunFile(Section):
             given = [f"gradcheck.{n}" for n in own if n in self.gradcheck.model_fields_set]
             others = {"radar", "grid", "rcs", "map"} - {seen}
             for path in [*given, *(n for n in sorted(others) if getattr(self, n))]:
-                what = f"expected nothing with [{seen}], which has its own, got a value; remove it"
-                raise_key_error(what, path)
+                raise_key_error(refusal_text("run.sections_of_others", seen), path)
             return
         if self.gradcheck.acts_on == "sensor":
-            raise_key_error(
-                "expected a parameter of the scene with [rcs], got radar_pose; turn the scene",
-                "gradcheck.parameter.kind",
-            )
+            raise_key_error(refusal_text("run.pose_with_rcs"), "gradcheck.parameter.kind")
         given = [name for name in ("radar", "grid") if getattr(self, name) is not None]
         given += [f"gradcheck.{n}" for n in _SAMPLING_KEYS if n in self.gradcheck.model_fields_set]
         for path in given:
-            raise_key_error(
-                "expected nothing with [rcs], which draws no paths, got a value; remove it", path
-            )
+            raise_key_error(refusal_text("run.sampling_with_rcs"), path)
 
     def _check_variant_names(self) -> None:
         for name in self.variants:
             if name in _RESERVED_NAMES or not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", name):
-                raise_key_error(
-                    "expected names of letters, digits and _ that begin with a letter, other than "
-                    f"{', '.join(_RESERVED_NAMES)}, got {json.dumps(name)}; choose another",
-                    "variants",
-                )
+                text = refusal_text("run.variants", ", ".join(_RESERVED_NAMES), json.dumps(name))
+                raise_key_error(text, "variants")
 
     def _check_parameter_names(self) -> None:
         names = [table.name or table.kind for table in self.parameters]
         free = {n for n, t in zip(names, self.parameters, strict=True) if t.kind == "vertices"}
         doubled = next((name for name in names if names.count(name) > 1), None)
         if doubled and (self.stages or self.variants):
-            raise_key_error(
-                f'expected parameters of different names, got "{doubled}" twice; add `name`'
-            )
+            raise_key_error(refusal_text("run.equal_names", doubled))
         own = set(names)
         if self.reconstruct is not None:
             for what, known in (("parameters", names), ("observations", [*self.observations])):
@@ -308,21 +298,13 @@ class _RunFile(Section):
             _require_known_names("parameters", stage.parameters, names, f"stages[{i}].parameters")
             fitted = own & set(stage.parameters or names)
             if stage.remesh and fitted and not fitted & free:
-                raise_key_error(
-                    'expected a parameter with kind = "vertices" among those of the stage, got '
-                    "none; add one, or remove `remesh`",
-                    f"stages[{i}].remesh",
-                )
+                raise_key_error(refusal_text("run.remesh_without_vertices"), f"stages[{i}].remesh")
 
     def _check_joint_starts(self) -> None:
         if self.starts is not None and self.starts.joint_deg > 0:
             name = self.starts.object
             if not any(p.kind == "body" and p.object == name for p in self.parameters):
-                raise_key_error(
-                    f'expected a parameter with kind = "body" of {name}, whose joints it turns, '
-                    "got none; add one, or remove `joint_deg`",
-                    "starts.joint_deg",
-                )
+                raise_key_error(refusal_text("run.joints_without_body", name), "starts.joint_deg")
 
     def _check_learned_shapes(self) -> None:
         unknowns = self.parameter_tables.values()
@@ -353,12 +335,9 @@ class _RunFile(Section):
         if self.dataset and self.chirps is None and "micro_doppler" in self.dataset.signals:
             raise_key_error("expected [chirps] with micro_doppler; add it", "dataset.signals")
         if self.observations:
-            raise_key_error(
-                "expected none with [dataset], which has one radar, got some", "observations"
-            )
+            raise_key_error(refusal_text("run.observations_with_dataset"), "observations")
         if self.data is not None and not isinstance(self.data, SimulatedData):
-            got = f'expected "simulated" with [dataset], got "{self.data.kind}"'
-            raise_key_error(f"{got}; give snr_db instead of a recording", "data.kind")
+            raise_key_error(refusal_text("run.measured_data", self.data.kind), "data.kind")
 
     def dump_without_dataset(self) -> dict[str, Any]:
         """As TOML, without what makes it a data set."""
@@ -417,8 +396,7 @@ class _RunFile(Section):
 def _require_known_names(what: str, used: list[str], known: list[str], path: str) -> None:
     for name in used:
         if name not in known:
-            got = f'expected names of {what} ({", ".join(known)}), got "{name}"; correct it'
-            raise_key_error(got, path)
+            raise_key_error(refusal_text("run.unknown_names", what, ", ".join(known), name), path)
 
 
 def _merge_table(table: Any, change: Any) -> Any:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from invertwin import scene as scenes
 from invertwin.checks import ArrayLike, Point, check_choice
+from invertwin.cli.refusals import refusal
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
@@ -173,9 +174,7 @@ class PanelParameter(ParameterTable):
         """The module of the section."""
         found = (given or {}).get(PanelPlacement)
         if not isinstance(found, PanelPlacement):
-            raise InputError(
-                "expected a section [placement] with the metasurface, got none; choose another kind"
-            )
+            raise refusal("shape_tables.no_placement")
         return found
 
 

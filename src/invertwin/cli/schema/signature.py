@@ -7,6 +7,7 @@ from annotated_types import MinLen
 from pydantic import model_validator
 from torch import Tensor
 
+from invertwin.cli.refusals import refusal_text
 from invertwin.limits import CountOfTwo, Positive
 from invertwin.registry.kinds import ConstructorTable, FormOf, OneOf
 from invertwin.registry.section import InputPath, Section, prefix_errors, raise_key_error
@@ -145,16 +146,13 @@ class RcsTable(ConstructorTable):
         named |= {f"measured[{i}]": m.channel for i, m in enumerate(self.measured)}
         for path, channel in named.items():
             if channel not in known:
-                raise_key_error(
-                    f"expected a channel of polarisation {self.polarisation} "
-                    f"({', '.join(known)}), got {channel}; choose one",
-                    f"{path}.channel",
+                text = refusal_text(
+                    "signature.channel", self.polarisation, ", ".join(known), channel
                 )
+                raise_key_error(text, f"{path}.channel")
         theta, phi = count_values(self.theta_deg), count_values(self.phi_deg)
         if theta != phi and 1 not in (theta, phi):
-            raise_key_error(
-                f"expected one angle or as many as theta_deg ({theta}), got {phi}", "phi_deg"
-            )
+            raise_key_error(refusal_text("signature.unequal_angles", theta, phi), "phi_deg")
         return self
 
     @property

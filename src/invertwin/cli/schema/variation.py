@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
+from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.datasets import UNCHANGED
 from invertwin.errors import InputError
 from invertwin.registry.section import raise_key_error, suggest_name
@@ -46,9 +47,7 @@ def check_samples(run: Any, raw: dict[str, Any], info: Any) -> None:
         at = f"vary[{number}]"
         for path in table.paths:
             if parse_key_path(path) in taken:
-                raise_key_error(
-                    f'expected every key once, got "{path}" twice; remove one', f"{at}.key"
-                )
+                raise_key_error(refusal_text("variation.key_twice", path), f"{at}.key")
             taken.add(parse_key_path(path))
         for value in table.build().extreme_values():
             try:
@@ -121,15 +120,9 @@ def _get_entry(holder: Any, step: str | int, path: str) -> Any:
         if isinstance(holder, list) and step < len(holder):
             return holder[step]
         got = f"a list of {len(holder)}" if isinstance(holder, list) else "none"
-        raise InputError(
-            f"{path}: expected a list in the run file with an entry [{step}], got {got}; state "
-            "the list, or vary it as a whole"
-        )
+        raise refusal("variation.no_entry", path, step, got)
     known = list(holder) if isinstance(holder, dict) else []
     if step in known:
         return holder[step]
-    raise InputError(
-        f"{path}: expected a table that the run file has "
-        f"({', '.join(known[:_MAX_LISTED_NAMES]) or 'none'}), "
-        f'got "{step}"; {suggest_name(step, known, "add it", 0.6)}'
-    )
+    choice = ", ".join(known[:_MAX_LISTED_NAMES]) or "none"
+    raise refusal("variation.key", path, choice, step, suggest_name(step, known, "add it", 0.6))
