@@ -67,13 +67,7 @@ def reconstruct_among_clutter(
     unknowns, plain = name_unknowns(parameters), None
     if not always:
         how: dict[str, Any] = {"schedule": schedule, "seed": seed, **options}
-        plain = inversion.reconstruct(scene, given, copy.deepcopy(unknowns), **how)
-        if not needs_permittivities(plain):
-            return plain
-        with suppress(InputError):  # the data do not determine permittivities
-            bright = reconstruct_with_permittivities(scene, given, copy.deepcopy(unknowns), **how)
-            if not needs_clutter(bright):
-                return bright
+        plain = _fit_without_clutter(scene, given, unknowns, **how)
         if not needs_clutter(plain):
             return plain
     sensors = [name_unknowns(o.parameters, f"sensor{k}.") for k, o in enumerate(given)]
@@ -111,6 +105,19 @@ def reconstruct_among_clutter(
             found = choose_result(found, bright)
     found = replace(found, doubts=tuple(_find_rivals(found.scene, given, fitted, seed)))
     return found if plain is None else choose_result(plain, found)
+
+
+def _fit_without_clutter(
+    scene: Scene, given: list[inversion.Observation], unknowns: dict[str, Unknown], **how: Any
+) -> inversion.Reconstruction:
+    """Fit copies of the parameters, with permittivities if the data are consistent with that."""
+    plain = inversion.reconstruct(scene, given, copy.deepcopy(unknowns), **how)
+    if needs_permittivities(plain):
+        with suppress(InputError):  # the data do not determine permittivities
+            bright = reconstruct_with_permittivities(scene, given, copy.deepcopy(unknowns), **how)
+            if not needs_clutter(bright):
+                return bright
+    return plain
 
 
 def reconstruct_with_permittivities(
@@ -200,11 +207,9 @@ def needs_permittivities(found: inversion.Reconstruction) -> bool:
     """True if the data contradict a result, or a permittivity that it holds."""
     if needs_clutter(found):
         return True
-    try:
-        contradicted = found.uncertainty.contradicted
-    except InputError:  # error bars are not available
-        return False
-    return any(name.endswith(".permittivity") for name in contradicted)
+    with suppress(InputError):  # error bars may not be available
+        return any(name.endswith(".permittivity") for name in found.uncertainty.contradicted)
+    return False
 
 
 def choose_result(

@@ -120,8 +120,7 @@ def twin(
         return Twin(_sort_objects([*found, *moving]), floor, picture)
     grid = radar.grid(reach[0], min(reach[1], _find_farthest_range(radar, places, floor)))
     search, one = _prepare_search(capture, grid, floor, places, step, rays, seed)
-    kept = None if checkpoint is None else Path(checkpoint)
-    still = _find_static_objects(capture, search, one, places, kept)
+    still = _find_static_objects(capture, search, one, places, checkpoint)
     notes = () if gains is None else (_NOTES["calibration"].format(phase_spread(gains, radar)),)
     resting = [one for one in still.objects if one.shape or not _is_moving(one, moving)]
     objects = _sort_objects([*resting, *moving])
@@ -202,13 +201,13 @@ def _find_static_objects(
     search: ShapeSearch,
     one: ShapeLikelihood,
     positions: Tensor,
-    checkpoint: Path | None,
+    checkpoint: str | Path | None,
 ) -> Twin:
     """Find the shapes that fit the maps of a recording, or until Ctrl-C the likeliest so far."""
     memory, sampling = one.memory, one.model.sampling
     told = Fingerprint(one.power, one.level, one.seed, sampling, positions)
-    if checkpoint is not None and checkpoint.exists():
-        memory.load(checkpoint, told)
+    if checkpoint is not None and Path(checkpoint).exists():
+        memory.load(Path(checkpoint), told)
     try:
         with defer_interrupt() as memory.heed:
             shapes, objects, notes = _search_shapes(capture, search, one, positions)
@@ -217,7 +216,7 @@ def _find_static_objects(
         if checkpoint is None:
             raise
         memory.heed, stopped = lambda: None, True
-        memory.save(checkpoint, told)
+        memory.save(Path(checkpoint), told)
         shapes, notes = search.best_so_far(), (_NOTES["stopped"],)
         sole = [[certainty.ShapeHypothesis(shape, 1.0)] for shape in shapes]
         objects = _describe_objects(one, {}, shapes, sole)
