@@ -169,11 +169,12 @@ def test_chunks_change_nothing(kind):
             sampling=replace(COUNTS, depth=3, memory_budget=budget),
             seed=3,
         )
-        gradients = torch.autograd.grad(out.square().sum(), list(values.values()))
+        # Weights that differ between bins would leave derivatives that nearly cancel.
+        gradients = torch.autograd.grad(out.sum(), list(values.values()))
         results.append([out, *gradients])
     for whole, *parts in zip(*results, strict=True):
         for pieces in parts:
-            assert relative(pieces, whole) < 1e-4
+            assert relative(pieces, whole) < 1e-5
 
 
 def test_depth_adds_to_what_is_there():
