@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import pytest
 import torch
@@ -174,11 +173,11 @@ def test_a_car_is_a_vehicle():
     assert abs(math.remainder(found.yaw - 0.6, 2 * math.pi)) < math.radians(4)
 
 
-@dataclass(frozen=True)
-class Frames:
+class Frames(ShapeLikelihood):
     """Frames whose likelihood of one or two shapes is known."""
 
-    gains: tuple[float, float]
+    def __init__(self, gains: tuple[float, float]) -> None:
+        object.__setattr__(self, "gains", gains)
 
     def total_gain(self, shapes: Sequence[ShapeParameters]) -> float:
         """Of one shape the first number, of two the second."""
@@ -193,9 +192,8 @@ class Frames:
 )
 def test_held_out_frames_add_to_the_evidence(evidence: float, held: float, better: bool):
     """A corner reflector that no held-out frame sees within its pattern gains 47 and loses 12."""
-    fitted: Any = Frames((0.0, evidence))
-    others: Any = Frames((0.0, held))
-    grid: Any = None
+    fitted, others = Frames((0.0, evidence)), Frames((0.0, held))
+    grid = object.__new__(ImageGrid)  # no image is looked at
     assert ShapeSearch(fitted, others, grid).is_better([BOX, BOX], [BOX]) == better
     # Without held-out frames, or with fewer shapes, the evidence alone decides.
     assert ShapeSearch(fitted, None, grid).is_better([BOX, BOX], [BOX]) == (evidence > 0)
