@@ -133,6 +133,7 @@ def test_the_viewer_of_a_folder(watched, pictures, folder, name, screen):
     with Viewer(display, links, port=0) as viewer:
         page.goto(viewer.address)
         page.wait_for_selector("canvas")
+        png = b""
         for _ in range(10):  # a scene comes late where others use the machine, too
             page.wait_for_timeout(2000)
             png = page.screenshot(path=str(pictures / f"{name}_{screen}.png"))

@@ -176,6 +176,8 @@ def test_a_car_is_a_vehicle():
 class Frames(ShapeLikelihood):
     """Frames whose likelihood of one or two shapes is known."""
 
+    gains: tuple[float, float]
+
     def __init__(self, gains: tuple[float, float]) -> None:
         object.__setattr__(self, "gains", gains)
 
