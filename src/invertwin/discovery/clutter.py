@@ -99,7 +99,7 @@ def reconstruct_among_clutter(
         return found
 
     again, found = copy.deepcopy(unknowns), fit_rounds(unknowns, 0)
-    if needs_clutter(found) and (free := _free_permittivities(fit)):
+    if needs_clutter(found) and (free := _free_permittivities(objects)):
         bright = fit_rounds(again | free, 2)
         if any(_has_moved(bright, key, objects) for key in free):
             found = choose_result(found, bright)
@@ -142,16 +142,17 @@ def reconstruct_with_permittivities(
             fitted object has a known permittivity.
     """
     unknowns = name_unknowns(parameters)
-    free = _free_permittivities(inversion.prepare_fit(scene, observations, unknowns))
+    fit = inversion.prepare_fit(scene, observations, unknowns)
+    free = _free_permittivities(fit.apply_modules()[0].objects)
     if not free:
         problem = "expected a fitted object of known permittivity beside one that is not fitted"
         raise InputError(f"{problem}, got none; use reconstruct")
     return inversion.reconstruct(scene, observations, unknowns | free, **options)
 
 
-def _free_permittivities(fit: inversion.Fit) -> dict[str, Unknown]:
+def _free_permittivities(objects: Mapping[str, Object]) -> dict[str, Unknown]:
     """Permittivities that determine how bright moved objects are, as unknowns."""
-    known = find_known_permittivities(fit)
+    known = find_known_permittivities(objects)
     values = {f"{n}.permittivity": MaterialValues(n, permittivity=e) for n, e in known.items()}
     return {name: Unknown(module) for name, module in values.items()}
 

@@ -328,7 +328,8 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
         problem = f"expected range_max beyond the leakage, which ends at {first:.3g} m"
         raise InputError(f"{problem}, got {limit:.3g}; give a larger one")
     grid = radar.grid(first, limit)
-    strongest, chance, note = _relate_to_noise(capture.spectrum(grid).detach(), radar, grid)
+    power = capture.spectrum(grid).detach().double()
+    strongest, chance, note = _relate_to_noise(power, radar, grid)
     loud = (strongest > chance).nonzero()[:, 0]
     if not len(loud):
         return note

@@ -31,7 +31,7 @@ else:
     mit = _Untyped()
 
 Mask: TypeAlias = mit.Bool | bool
-"""Which lanes take part: one value for each, or one for all."""
+"""Active lanes: one value for each, or one for all."""
 VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 
 

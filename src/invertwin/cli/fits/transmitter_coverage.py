@@ -103,7 +103,7 @@ class TransmitterCoverage(ReceivedLevels):
 
 
 def _describe(fits: Fits) -> str:
-    """Where the transmitter belongs, and what that gains, in the units of the run file."""
+    """State the place of the transmitter and its gain, in the units of the run file."""
     tried, run = fits.problem.notes["tried"], fits.problem.run
     aim, unit = require_section(run, "aim", "a placement"), radio_map(run, None).unit
     after, gain = fits.best["aim_after"], fits.best["aim_after"] - fits.best["aim_before"]

@@ -142,7 +142,7 @@ class TransmitterStartsTable(Section):
 
 
 class AimTable(Section):
-    """What a transmitter is placed for, in place of data; a receiver has its strongest transmitter.
+    """Aim of the place of a transmitter, instead of data; a receiver has its strongest transmitter.
 
     Attributes:
         measure: mean level, worst_tenth (level below which a tenth of the receivers lies), or
@@ -187,7 +187,7 @@ class AimTable(Section):
         return ((above / softness).sigmoid() if softness else (above > 0).double()).mean()
 
     def loss(self, levels: Tensor, before: Tensor) -> Tensor:
-        """What a fit lowers: the share that is not covered, or a ratio of powers.
+        """Compute the loss of a fit: the share that is not covered, or a ratio of powers.
 
         Args:
             levels: [tx, ...] in decibels.

@@ -17,6 +17,7 @@ from invertwin.inversion.forward_mode import map_tangents
 from invertwin.inversion.gauss_newton import penalty_curvature
 from invertwin.inversion.loss import CURVED
 from invertwin.runtime.progress import track
+from invertwin.scene import Object
 from invertwin.scene.parameters import Coordinate, Entries, MaterialValues, Scale
 
 _MAX_COORDINATES = 64  # each coordinate costs derivatives of the map
@@ -345,17 +346,15 @@ def _mean_derivatives(fit: Fit, coordinates: Sequence[Coordinate]) -> list[list[
     return [[(a + b) / 2 for a, b in pairs], [(a - b) / 2 for a, b in pairs]]
 
 
-def find_known_permittivities(fit: Fit) -> dict[str, float]:
-    """Return the permittivities that a fit holds of objects that it moves.
+def find_known_permittivities(objects: Mapping[str, Object]) -> dict[str, float]:
+    """Return the permittivities of the objects that move, as far as they are known.
 
     There is none if all objects move: only others determine the gain of the data, and with it how
     bright an object is.
 
     Args:
-        fit: fit with its scene and its unknowns.
+        objects: objects of a scene to which the parameters of a fit are applied.
     """
-    with torch.enable_grad():
-        objects = fit.apply_modules()[0].objects
     moved = {name: item for name, item in objects.items() if item.vertices.requires_grad}
     found = {name: vars(item.material).get("permittivity") for name, item in moved.items()}
     known = {n: value for n, value in found.items() if isinstance(value, float) and value > 1}
@@ -371,7 +370,7 @@ def _find_held_values(fit: Fit) -> Iterator[tuple[nn.Module, float]]:
     held = [name for name, mesh in moved.items() if not mesh.vertices.requires_grad]
     for name in held:
         yield Scale(name), _SIZE_DEVIATION
-    for name, value in find_known_permittivities(fit).items():
+    for name, value in find_known_permittivities(objects).items():
         if name in held:
             deviation = _BRIGHTNESS_DEVIATION * (value - 1)
             yield MaterialValues(name, permittivity=value), deviation
