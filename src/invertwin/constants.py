@@ -1,6 +1,7 @@
 """Physical constants in SI units (CODATA 2018), tables of data, and the mark of our axes."""
 
 import tomllib
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -14,8 +15,9 @@ OLD_AXES = (2, 0, 1)
 """Places of x forward, y left, z up among the axes of a file without a mark."""
 
 
+@cache
 def read_table(package: str, name: str) -> dict[str, Any]:
-    """Read a TOML table of data that lies beside the modules of a package.
+    """Read a TOML table of data that lies beside the modules of a package, once.
 
     Args:
         package: such as ``invertwin.radar``.

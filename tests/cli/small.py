@@ -8,6 +8,17 @@ import pytest
 
 from invertwin.cli import app
 
+#: Head of run files of links in a room.
+ROOM = """
+task = "reconstruct"
+frame = 2
+seed = 4
+
+[scene.room]
+shape = "box"
+size = [5.0, 4.0, 3.0]
+material = { kind = "dielectric", permittivity = 4.0, conductivity = 0.05, scattering = 0.0 }
+"""
 RUN = """
 task = "reconstruct"
 frame = 2

@@ -8,7 +8,7 @@ import tomllib
 import pytest
 import torch
 
-from cli.small import call, read_metrics
+from cli.small import ROOM, call, read_metrics
 from invertwin.cli.fits.received_levels import spread_of_ends
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.run_file import to_toml, validate_run
@@ -18,16 +18,9 @@ from invertwin.errors import InputError
 from invertwin.inversion import SpectrumLoss
 from invertwin.links import ReceiverPoints
 
-RUN = """
-task = "reconstruct"
-frame = 2
-seed = 4
-
-[scene.room]
-shape = "box"
-size = [5.0, 4.0, 3.0]
-material = { kind = "dielectric", permittivity = 4.0, conductivity = 0.05, scattering = 0.0 }
-
+RUN = (
+    ROOM
+    + """
 [scene.pillar]
 shape = "box"
 size = [0.4, 0.4, 2.0]
@@ -67,6 +60,7 @@ position_limit = 0.5
 [variants.bare]
 map = { without = ["pillar"] }
 """
+)
 STARTS = """
 [transmitter_starts]
 low = [-2.2, -1.7, -1.0]

@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from cli.small import call, read_metrics
+from cli.small import ROOM, call, read_metrics
 from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import build
 from invertwin.errors import InputError
@@ -14,16 +14,9 @@ from invertwin.links import TransmitterPosition, Transmitters
 from invertwin.scene import Mesh, signed_distance
 
 # Receivers nearer to the shelf, whose front is at x = 0.2 m, than a transmitter may be.
-ROOM = """
-task = "reconstruct"
-frame = 2
-seed = 4
-
-[scene.room]
-shape = "box"
-size = [5.0, 4.0, 3.0]
-material = { kind = "dielectric", permittivity = 4.0, conductivity = 0.05, scattering = 0.0 }
-
+RUN = (
+    ROOM
+    + """
 [scene.shelf]
 shape = "box"
 size = [0.4, 2.0, 2.0]
@@ -56,6 +49,7 @@ rate = 0.15
 steps = 8
 checkpoint_every = 1
 """
+)
 STARTS = """
 [transmitter_starts]
 low = [-2.0, -1.5, -1.0]
@@ -64,7 +58,7 @@ count = 6
 """
 
 
-def place(monkeypatch, folder, text=ROOM):
+def place(monkeypatch, folder, text=RUN):
     """Metrics of a run in a folder."""
     file, out = folder / "room.toml", folder / "out"
     file.write_text(text, encoding="utf-8")
@@ -90,7 +84,7 @@ def shelf_distance(run, position):
     ],
 )
 def test_each_aim_is_raised_and_said(aim, words, tmp_path, monkeypatch, capsys):
-    text = ROOM.replace('measure = "mean"', aim) + STARTS
+    text = RUN.replace('measure = "mean"', aim) + STARTS
     found = place(monkeypatch, tmp_path, text)
     assert found["aim_before"] == max(found["tried"])
     assert len(found["tried"]) == 6
@@ -119,7 +113,7 @@ def test_clear_keeps_the_transmitter_off_the_furniture(tmp_path, monkeypatch):
     assert shelf_distance(run, kept["parameters"]["transmitter.position"]) >= 0.4
     # It slides along the shelf to the middle of the receivers: only the way to the shelf is barred.
     assert abs(kept["parameters"]["transmitter.position"][1]) < 0.25
-    free = place(monkeypatch, tmp_path, ROOM.replace("clear = 0.4\n", ""))
+    free = place(monkeypatch, tmp_path, RUN.replace("clear = 0.4\n", ""))
     assert shelf_distance(run, free["parameters"]["transmitter.position"]) < 0.35
     assert free["aim_after"] > kept["aim_after"]
 
@@ -167,8 +161,8 @@ def test_an_interrupted_placement_goes_on_as_if_nothing_had_been(tmp_path, monke
 )
 def test_mistakes_are_one_line(old, new, words, tmp_path, monkeypatch, capsys):
     file = tmp_path / "room.toml"
-    assert old in ROOM
-    file.write_text(ROOM.replace(old, new), encoding="utf-8")
+    assert old in RUN
+    file.write_text(RUN.replace(old, new), encoding="utf-8")
     assert call(monkeypatch, "reconstruct", file, "-o", tmp_path / "out") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert words in line
@@ -179,13 +173,13 @@ def test_keys_and_check_know_an_aim(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "measure" in said
     assert "level" in said
-    (tmp_path / "room.toml").write_text(ROOM + STARTS)
+    (tmp_path / "room.toml").write_text(RUN + STARTS)
     assert call(monkeypatch, "check", tmp_path / "room.toml") == 0
     assert re.search(r"about .+ for 8 steps", capsys.readouterr().out)
 
 
 def test_a_step_into_furniture_loses_the_axes_that_lead_there(tmp_path):
-    (tmp_path / "room.toml").write_text(ROOM)
+    (tmp_path / "room.toml").write_text(RUN)
     scene = build.scene(load_run(tmp_path / "room.toml"))
     box = {"low": [-2.4, -1.9, -1.4], "high": [2.4, 1.9, 1.4]}
     module = TransmitterPosition([0.7, 0.3, 0.0], **box, clear=0.4, scene=scene)

@@ -3,16 +3,15 @@
 import base64
 import math
 import os
-import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
-from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from invertwin import __version__
+from invertwin.constants import read_table
 
 if TYPE_CHECKING:  # Matplotlib takes half a second, and most errors come before any figure
     from matplotlib.figure import Figure
@@ -78,7 +77,8 @@ def report_html(
     given = {"title": title, "status": status, "note": note, "parts": parts, "files": files}
     given |= {"version": __version__, "policy": content_security_policy()}
     given["command"] = f"invertwin {again} -o again" + (f" --backend {backend}" if backend else "")
-    return pages.from_string(_read_resource("report.html.jinja")).render(given)
+    page = (resources.files("invertwin.cli") / "report.html.jinja").read_text(encoding="utf-8")
+    return pages.from_string(page).render(given)
 
 
 def write_report(
@@ -160,14 +160,9 @@ def quantity_table(
     return ReportTable(title, ["quantity", "value"], rows)
 
 
-@cache
 def load_texts(name: str) -> dict[str, str]:
     """A table of texts.toml."""
-    return tomllib.loads(_read_resource("texts.toml"))[name]
-
-
-def _read_resource(name: str) -> str:
-    return (resources.files("invertwin.cli") / name).read_text(encoding="utf-8")
+    return read_table("invertwin.cli", "texts.toml")[name]
 
 
 def is_numeric_cell(value: Any) -> bool:
