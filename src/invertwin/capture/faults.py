@@ -262,7 +262,7 @@ def detect_ghosts(
     rate. The copy has the echo's line shape, channels and range rates, times one factor g; of real
     samples, and where I and Q alternate, also the conjugate at ``½ − f``. Where I and Q differ in
     gain, or by another phase than 90°, the conjugate is at ``−f``, with the opposite direction and
-    range rate, and weaker than the echo (else it is a pair). Such a copy is told from
+    range rate, and weaker than the echo (else it is a pair). Such a copy is distinguished from
     an echo of its own by what is left once ``g`` times the echo is taken away: noise, and at most
     3 % of the copy. The copy's energy is at least 100 times what noise and other echoes have beside
     it, below which chance agreement is frequent.

@@ -111,7 +111,7 @@ def triangle_visibility(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "
 
     Args:
         scene: Surfaces in the world.
-        radar: Its positions, one a frame; antennas are not told apart.
+        radar: Its positions, one a frame; antennas are not distinguished.
     """
     meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
     points = [_sample_triangles(mesh) for mesh in meshes]

@@ -191,9 +191,9 @@ class ShapeLikelihood:
         free, data = self.unknowns(shapes), Observation(self.model, self.power, sensor=self.radar)
         plan, loss, seed = Schedule(steps, annealing=0.5), self.loss, self.seed
         done = track(range(steps + 1), f"steps of a fit of {len(shapes)} objects")
-        told = [Report(lambda _: (self.memory.heed(), next(done, None)))]
+        hooks = [Report(lambda _: (self.memory.heed(), next(done, None)))]
         found = reconstruct(
-            scene, data, free, loss=loss, optimizer=adam, schedule=plan, seed=seed, callbacks=told
+            scene, data, free, loss=loss, optimizer=adam, schedule=plan, seed=seed, callbacks=hooks
         )
         return [one.shape for one in free.values()], found
 

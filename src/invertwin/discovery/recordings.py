@@ -205,9 +205,9 @@ def _find_static_objects(
 ) -> Twin:
     """Find the shapes that fit the maps of a recording, or until Ctrl-C the likeliest so far."""
     memory, sampling = one.memory, one.model.sampling
-    told = Fingerprint(one.power, one.level, one.seed, sampling, positions)
+    fingerprint = Fingerprint(one.power, one.level, one.seed, sampling, positions)
     if checkpoint is not None and Path(checkpoint).exists():
-        memory.load(Path(checkpoint), told)
+        memory.load(Path(checkpoint), fingerprint)
     try:
         with defer_interrupt() as memory.heed:
             shapes, objects, notes = _search_shapes(capture, search, one, positions)
@@ -216,7 +216,7 @@ def _find_static_objects(
         if checkpoint is None:
             raise
         memory.heed, stopped = lambda: None, True
-        memory.save(Path(checkpoint), told)
+        memory.save(Path(checkpoint), fingerprint)
         shapes, notes = search.best_so_far(), (_NOTES["stopped"],)
         sole = [[certainty.ShapeHypothesis(shape, 1.0)] for shape in shapes]
         objects = _describe_objects(one, {}, shapes, sole)

@@ -14,7 +14,7 @@ from invertwin.plotting.figures import PALETTE, legible, numbers, row_of_axes
 from invertwin.scene import Scene
 
 _MARKS = (("*", "#c0143c"), ("+", PALETTE[1]), (".", PALETTE[2]))
-_SPAN = 60.0  # dB below the strongest that are told apart
+_SPAN = 60.0  # dB below the strongest that are distinguished
 
 
 def floor_plan(

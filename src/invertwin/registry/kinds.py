@@ -467,7 +467,7 @@ def load_plugins() -> Registry:
 
 
 def number_or_list(*kinds: Any) -> Any:
-    """A type that is told by its form, a list, a table or else, so that errors name no member."""
+    """A type that is known by its form, a list, a table or else, so that errors name no member."""
 
     def tag(kind: Any) -> str:
         bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind

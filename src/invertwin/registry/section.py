@@ -101,8 +101,8 @@ class Section(BaseModel):
             return handler(data)
         unknown = unknown[:_MAX_UNKNOWN]
         # Pydantic's own error for an extra key does not carry the keys that are allowed.
-        told = [{"key": name, "allowed": names} for name in unknown]
-        kinds = [PydanticCustomError("unknown_key", "unknown key", context) for context in told]
+        contexts = [{"key": name, "allowed": names} for name in unknown]
+        kinds = [PydanticCustomError("unknown_key", "unknown key", context) for context in contexts]
         found = [InitErrorDetails(type=kind, loc=(), input=data) for kind in kinds]
         meant = {m for n in unknown for m in difflib.get_close_matches(str(n), names, cutoff=0.5)}
         try:

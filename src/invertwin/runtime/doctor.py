@@ -265,8 +265,8 @@ def collect_report() -> dict[str, Any]:
     for candidate in _add_explicit(find_libraries()):
         verdict = _probe_cached(candidate.path, probe_library)
         version = ".".join(map(str, candidate.version))
-        told = {"usable": verdict.usable, "verdict": verdict.reason}
-        examined.append({"path": candidate.path, "version": version, **told})
+        status = {"usable": verdict.usable, "verdict": verdict.reason}
+        examined.append({"path": candidate.path, "version": version, **status})
     gpu, fix = gpu_name(), None
     try:
         require_backend(requested)

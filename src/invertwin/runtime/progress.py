@@ -1,4 +1,4 @@
-"""Progress of long work, told to whoever listens; by default nobody does."""
+"""Progress of long work, for observers; by default there are none."""
 
 import time
 from collections.abc import Callable, Collection, Generator

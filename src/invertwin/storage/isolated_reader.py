@@ -101,14 +101,14 @@ def read_isolated(
         return _unpack_arrays(said)
     if code == _MISSING:
         raise KeyError(variable)
-    told = {
+    causes = {
         _TIMED_OUT: f"one that takes its reader more than {seconds:.0f} s",
         _TOO_LARGE: f"one that asks for more than {memory / 1e9:.1f} GB",
         _REFUSED: f"one that its reader refuses ({said.decode(errors='replace').strip()})",
     }
     crash = f"one that crashes its reader ({signal.Signals(-code).name if code < 0 else code})"
     raise InputError(
-        f"expected a whole {_NAMES[kind]} file, got {path}, {told.get(code, crash)}; it is "
+        f"expected a whole {_NAMES[kind]} file, got {path}, {causes.get(code, crash)}; it is "
         "damaged or of another kind: copy or record it again. If you trust it, say trusted = True"
     )
 

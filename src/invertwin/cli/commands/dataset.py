@@ -175,7 +175,7 @@ def make_shard(job: tuple[str, int, int]) -> bytes:
     run = validate_run(tomllib.loads(text), Path("run.toml"))
     samples = ((index, make_sample(run, index)) for index in range(first, first + count))
     with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
+        warnings.simplefilter("ignore", PhysicsWarning)  # issued once, where the run began
         return shards.pack_shard(samples)
 
 
@@ -200,9 +200,9 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         arrays["masks"] = torch.cat(list(seen.values()), dim=1).numpy()
     joints = motion_tables.joint_positions_at_start(own, begun)
     objects = labels.object_labels(begun, seen, table.classes, joints)
-    told = {"index": index, "objects": objects, "radar": labels.radar_labels(sensor.radar)}
+    label = {"index": index, "objects": objects, "radar": labels.radar_labels(sensor.radar)}
     files = {f"{name}.npy": shards.npy_bytes(array) for name, array in arrays.items()}
-    text = json.dumps(told, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(label, ensure_ascii=False, allow_nan=False)
     return files | {"labels.json": text.encode(), "run.toml": to_toml(own).encode()}
 
 

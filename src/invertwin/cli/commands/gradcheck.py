@@ -117,8 +117,8 @@ def run_gradcheck(batch: RunBatch, say: Callable[[str], None]) -> tuple[list[Rep
     rows = [_table_row(*item) for item in scenes.items()]
     legend = load_texts("notes")["gradcheck"]
     # Omit columns that are empty for all scenes, such as contacts: they would narrow the others.
-    told = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
-    columns, rows = [_TABLE_COLUMNS[k] for k in told], [[row[k] for k in told] for row in rows]
+    used = [k for k in range(len(_TABLE_COLUMNS)) if any(row[k] is not None for row in rows)]
+    columns, rows = [_TABLE_COLUMNS[k] for k in used], [[row[k] for k in used] for row in rows]
     table = ReportTable("Agreement with central differences", columns, rows, legend)
     status = "1 scene checked." if len(scenes) == 1 else f"{len(scenes)} scenes checked."
     parts = [table, *studies, *pictures]

@@ -67,5 +67,5 @@ def evaluate_exact_losses(
     drawn = {"samples": data.samples, "points_per_m2": data.points_per_m2, "boundary": False}
     observation = replace(observation, model=observation.model.with_sampling(depth=1, **drawn))
     seed = run.seed if data.seed is None else data.seed
-    told = track(offsets.tolist(), "loss landscape, exact signal")
-    return evaluate_losses(line, told, observation, seed=seed).numpy()
+    steps = track(offsets.tolist(), "loss landscape, exact signal")
+    return evaluate_losses(line, steps, observation, seed=seed).numpy()

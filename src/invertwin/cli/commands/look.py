@@ -96,14 +96,14 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     kind = "directions" if chirps is None else "doppler"
     view = save_picture(folder, "look", plotting.panels(shown), f"Frame {options.frame}", kind)
     status = f"{answer}; frames: {radar.frame_count}, read as {reader}."
-    told = {"again": options.command("look", folder.path), "note": notes["look"]}
+    texts = {"again": options.command("look", folder.path), "note": notes["look"]}
     parts = [view, *draw_spectrogram(maps, folder), quantity_table(title, metrics)]
     parts += warning_tables(said)
     if grid.u_count > 1 and points is not None and len(points):
         of_frame, one = {f"frame {options.frame}": power[None]}, radar.frames([options.frame])
         above = plotting.from_above(of_frame, grid, one, {"detections": points.position})
         parts.insert(1, save_picture(folder, "above", above, "From above", "above"))
-    return report.write_report(folder, metrics, title, status, parts, **told), answer
+    return report.write_report(folder, metrics, title, status, parts, **texts), answer
 
 
 def is_far_only(points: radars.PointCloud, recording: AnyRecording) -> bool:

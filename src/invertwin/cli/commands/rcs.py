@@ -57,8 +57,8 @@ def run_rcs(batch: RunBatch, say: Callable[[str], None]) -> tuple[list[ReportTab
     skipped = [file for found in scenes.values() for file in found.get("skipped", ())]
     if skipped:
         missing = f"{len(skipped)} measured files are not there, such as {skipped[0]}"
-        told = f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA"
-        warnings.warn(told, UserWarning, stacklevel=2)
+        text = f"skipped a comparison: {missing}; get the data and set INVERTWIN_DATA"
+        warnings.warn(text, UserWarning, stacklevel=2)
         status += f" Skipped a comparison: {missing}."
     parts = [*pictures[:1], *_make_tables(scenes), *pictures[1:]]
     return write_report(folder, metrics, "Radar signatures", status, parts, again="rcs"), answer

@@ -62,8 +62,8 @@ def run_simulate(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
         parts.append(save_picture(folder, "above", above, "From above", "above"))
     count = f"{found['chirps']} chirps a frame" if run.chirps else f"{found['paths']} paths"
     title, status = run.title or "Simulation", f"{answer}; {count}, frames: {radar.frame_count}."
-    told = {"again": "simulate", "note": run.note}
-    return report.write_report(folder, metrics, title, status, parts, **told), answer
+    notes = {"again": "simulate", "note": run.note}
+    return report.write_report(folder, metrics, title, status, parts, **notes), answer
 
 
 def _simulate_frames(

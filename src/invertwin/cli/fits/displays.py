@@ -35,7 +35,7 @@ class StepRecorder(Callback):
         names: Objects that are kept.
         total: Steps of all stages.
         every: Steps between checkpoints: what is kept goes on with these.
-        show: Is told of every step that is kept.
+        show: Observer of every step that is kept.
     """
 
     file: Path

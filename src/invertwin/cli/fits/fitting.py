@@ -36,7 +36,7 @@ from invertwin.viewer import DisplayStep
 _MIN_RELATIVE_PEAK = 0.1  # of the echo where a fit ends: a weaker one was not meant
 
 Show = Callable[[Problem, Fit, DisplayStep], None]
-"""Is told of the steps of a fit as they come."""
+"""Observer of the steps of a fit."""
 
 
 def fit_all(
@@ -48,15 +48,15 @@ def fit_all(
         problem: Problem of the run.
         folder: Keeps results and checkpoints.
         console: Shows progress.
-        show: Is told of steps as they come.
+        show: Observer of the steps.
     """
     rows: dict[str, list[Row]] = {method: [] for method in problem.methods}
     outcomes: dict[tuple[str, int], Callable[[], inversion.Reconstruction]] = {}
     for method, number in problem.work:
         own = problem.kind.with_recording_of_start(problem, number, console)
-        told = None if show is None else partial(show, own)
+        observer = None if show is None else partial(show, own)
         start = problem.starts(method)[number]
-        row, outcome = run_fit(own, start, number, method, folder, console, told)
+        row, outcome = run_fit(own, start, number, method, folder, console, observer)
         rows[method].append(row)
         if method not in problem.run.variants:
             outcomes[method, number] = outcome
@@ -176,7 +176,7 @@ def run_fit(
         method: The run's own way to fit, a variant, or one of the data.
         folder: Keeps results and checkpoints.
         console: Shows progress.
-        show: Is told of steps as they come.
+        show: Observer of the steps.
 
     Returns:
         The row of the fit, and a function that gives its outcome.

@@ -102,10 +102,10 @@ class RadarMaps(DataKind):
         found: Row = scores.summarise_successes(problem, rows, methods)
         if radar_models.has_recording_per_start(problem.run):
             found |= error_bar_coverage(rows[problems.OWN_METHOD])
-        told = [k for k in best if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"]
+        shown = [k for k in best if (k in START_COLUMNS or is_shape_key(k)) and k != "seconds"]
         measured = fits.maps["measured"]
         found |= {
-            **{key: best[key] for key in told},
+            **{key: best[key] for key in shown},
             "start_loss_sharp": scores.total_loss(problem, fits.maps["start"], measured),
             "loss_sharp": scores.total_loss(problem, fits.maps["twin"], measured),
             **scores.surrogate_agreement(problem, fits.found.scene, fits.found.sensors[0]),

@@ -255,7 +255,7 @@ def _find_other_ends(fits: Fits) -> Row:
     if not has_transmitter(run):
         return {}
     limit, best = run.fit_settings.position_limit, fits.found
-    kept, told = [best.sensors[0].positions[0].detach()], []
+    kept, notes = [best.sensors[0].positions[0].detach()], []
     for row in sorted(fits.rows[problems.OWN_METHOD], key=problems.rank):
         if row["start"] == fits.best["start"]:
             continue
@@ -267,8 +267,8 @@ def _find_other_ends(fits: Fits) -> Row:
         found = difference_score(best.result, end.result)
         if found is not None and found < REJECTION_ZSCORE:
             where = format_place(place.tolist())
-            told.append(f"a transmitter at {where} m fits the data equally well: z = {found:.1f}")
-    return {"ambiguities": told} if told else {}
+            notes.append(f"a transmitter at {where} m fits the data equally well: z = {found:.1f}")
+    return {"ambiguities": notes} if notes else {}
 
 
 def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[str, float]) -> Row:

@@ -203,8 +203,8 @@ def error_bar_table(metrics: Row, values: Mapping[str, Sequence[Any]] | None = N
     heads += ["coverage", *_BAR_COLUMNS.values()]
     kept = [k for k in range(len(heads)) if not k or any(row[k] is not None for row in cells)]
     heads, cells = [heads[k] for k in kept], [[row[k] for k in kept] for row in cells]
-    told = ("verdict_reasons", "ambiguities", "unobserved", "early_stops")
-    said = [text for key in told for text in metrics.get(key, [])]
+    sources = ("verdict_reasons", "ambiguities", "unobserved", "early_stops")
+    said = [text for key in sources for text in metrics.get(key, [])]
     said += [metrics["spread_note"]] if "spread_note" in metrics else []
     note = "error_bars_without_model" if metrics.get("verdict") in DOUBTED else "error_bars"
     said.append(metrics.get("no_error_bars", load_texts("notes")[note]))

@@ -113,7 +113,7 @@ def run_fit_job(
     """
     run = validate_run(tomllib.loads(run_toml), Path("run.toml"))
     with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
-        warnings.simplefilter("ignore", PhysicsWarning)  # told once, where the run began
+        warnings.simplefilter("ignore", PhysicsWarning)  # issued once, where the run began
         with open_run(Path(scratch, "fit"), {"run": run_toml}) as folder:
             for name, content in files.items():
                 folder.write_bytes(name, content)

@@ -45,8 +45,8 @@ def make_tables(fits: Fits, metrics: Row) -> list[ReportTable]:
             keys = [key for key in START_COLUMNS if key in rows[0]]
             cells: list[list[Any]] = []
             for row in rows:
-                told = (_format_status(key, row[key], row.get("lost", False)) for key in keys)
-                cells.append([row["start"] + 1, *told])
+                values = (_format_status(key, row[key], row.get("lost", False)) for key in keys)
+                cells.append([row["start"] + 1, *values])
             heads = ["start", *(START_COLUMNS[key] for key in keys)]
             tables.append(ReportTable(f"Starts, {way}", heads, cells))
     if len(fits.rows) > 1 and any(is_shape_key(key) for key in metrics):
@@ -226,8 +226,8 @@ def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPic
     before = metrics["start_loss_sharp"] if annealed else None
     figure, note = plotting.convergence(losses, annealed=annealed, before=before), ""
     if annealed is not None:
-        told = None not in (before, metrics["loss_sharp"])
-        note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if told else "")
+        known = None not in (before, metrics["loss_sharp"])
+        note = notes["loss"] + (notes["loss_sharp"].format(**metrics) if known else "")
     found.append(report.save_picture(folder, "loss", figure, note=note))
     if run.measures is not None:
         folder.write_bytes("turntable.gif", _draw_turntable(problem, ends, run.measures.object))
