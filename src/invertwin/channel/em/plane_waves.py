@@ -371,32 +371,35 @@ def polygon_integral(
     scattered fields", IEEE TAP 23, 1975. It is a sum over the sides; near w ⊥ polygon the sum is
     0/0 and the series about the centroid to second order replaces it.
     """
-    area = area_vector(polygon)
+    # Sums over lists of columns are ten times as fast as those over an axis of three.
+    points = polygon.unbind(1)
+    centroid = sum(points[1:], points[0]) / len(points)
+    corners = [point - centroid for point in points]
+    spokes = polygon[:, 1:] - polygon[:, :1]
+    fan = torch.linalg.cross(spokes[:, :-1], spokes[:, 1:]).unbind(1)
+    area = sum(fan[1:], fan[0])
     normal = area / area.norm(dim=-1).clamp_min(1e-300)[:, None]
-    centroid = polygon.mean(1)
     tangential = direction - dot(direction, normal)[:, None] * normal
     square = dot(tangential, tangential)
-    corners = polygon - centroid[:, None]
-    length = tangential.detach().abs().square().sum(-1)
-    largest = length * corners.detach().norm(dim=-1).amax(1) ** 2
-    ends = corners.roll(-1, 1)
-    sides = ends - corners
-    phase = dot(tangential[:, None], corners + ends) / 2
-    side_factor = dot(cross(sides, normal[:, None]), tangential[:, None])
-    half_phase = dot(tangential[:, None], sides) / 2
+    extent = torch.stack([dot(corner, corner) for corner in corners]).detach().amax(0)
+    largest = tangential.detach().abs().square().sum(-1) * extent
+    turned = cross(normal, tangential)
+    first = torch.stack([dot(tangential, corner) for corner in corners])
+    across = torch.stack([dot(turned, corner) for corner in corners])
+    ends = first.roll(-1, 0)
+    phase, half_phase = (first + ends) / 2, (ends - first) / 2
+    side_factor = across.roll(-1, 0) - across
     centroid_phase = dot(direction, centroid)
     # ∫(1 + jw·x − (w·x)²/2) over the fan of triangles at the first corner.
-    first = dot(tangential[:, None], corners)
-    spokes = corners - corners[:, :1]
-    weight = dot(torch.linalg.cross(spokes[:, 1:-1], spokes[:, 2:], dim=-1), normal[:, None]) / 2
-    a, b, c = first[:, :1], first[:, 1:-1], first[:, 2:]
-    mean = (weight * (a + b + c)).sum(1) / 3
-    second = (weight * (a * a + b * b + c * c + a * b + a * c + b * c)).sum(1) / 6
-    weight = weight.sum(1)
+    weight = torch.stack([dot(triangle, normal) for triangle in fan]) / 2
+    a, b, c = first[:1], first[1:-1], first[2:]
+    mean = (weight * (a + b + c)).sum(0) / 3
+    second = (weight * (a * a + b * b + c * c + a * b + a * c + b * c)).sum(0) / 6
+    weight = weight.sum(0)
 
     def evaluate(k: float) -> Tensor:
         near_normal = largest * k**2 < 1e-6
-        exact = (side_factor * _sinc(k * half_phase) * phasor(k * phase)).sum(1)
+        exact = (side_factor * _sinc(k * half_phase) * phasor(k * phase)).sum(0)
         exact = exact / torch.where(near_normal, torch.ones_like(square), square * k) / 1j
         series = weight + 1j * k * mean - k**2 * second / 2
         return torch.where(near_normal, series, exact) * phasor(k * centroid_phase)

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
@@ -456,13 +456,51 @@ def find_next_surface(
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-    origin = rays.to_local_points(start)
-    offset = rays.to_local_points(end) - origin
+    face, along = _cast_segments(rays, rays.to_local_points(start), rays.to_local_points(end))
+    return face, along.double()
+
+
+def find_surfaces_along(
+    rays: Occluders,
+    points: Float64[Tensor, "row point 3"],
+    offset: Float64[Tensor, "row 3"],
+    way: Float64[Tensor, "row 3"],
+) -> tuple[Int64[Tensor, "row point"], Float32[Tensor, "row point"]]:
+    """Find the first triangles from all points of a row along one segment, in one kernel.
+
+    Args:
+        rays: occluders.
+        points: world points [m].
+        offset: from the points to the segments' starts [m].
+        way: from the segments' starts to their ends [m].
+
+    Returns:
+        Triangle indices (−1: none), and positions along the segments from 0 to 1.
+    """
+    if not points.numel():
+        shape = points.shape[:2]
+        return torch.zeros(shape, dtype=torch.int64), torch.zeros(shape)
+    lane = dr.arange(mi.UInt32, points.shape[0] * points.shape[1])
+    row = lane // points.shape[1]
+    local = dr.gather(mi.Vector3d, arrays.to_double(rays.origin), mi.UInt32(0))
+    start = dr.gather(mi.Vector3d, arrays.to_double(points), lane)
+    start += dr.gather(mi.Vector3d, arrays.to_double(offset), row)
+    end = start + dr.gather(mi.Vector3d, arrays.to_double(way), row)
+    found = _cast_segments(rays, mi.Point3f(start - local), mi.Point3f(end - local))
+    return found[0].view(points.shape[:2]), found[1].view(points.shape[:2])
+
+
+def _cast_segments(
+    rays: Occluders, origin: mit.Point3f, end: mit.Point3f
+) -> tuple[Int64[Tensor, " n"], Float32[Tensor, " n"]]:
+    """First triangle on segments between local points (−1: none), and positions along them."""
+    offset = end - origin
     ray = mi.Ray3f(origin + offset * RAY_EPSILON, mi.Vector3f(offset), 1 - 2 * RAY_EPSILON, 0.0, [])
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
-    return arrays.to_torch(face).long(), arrays.to_torch(along).double()
+    dr.eval(face, along)
+    return arrays.to_torch(face).long(), arrays.to_torch(along)
 
 
 def find_passed_sheets(

@@ -15,7 +15,11 @@ from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Facets, IlluminatedPatches, patches_in_air
 from invertwin.channel.em.plane_waves import dot, reflect_vectors
-from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
+from invertwin.channel.rays.ray_scene import (
+    Occluders,
+    find_next_surface,
+    find_surfaces_along,
+)
 
 _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
 _CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
@@ -255,23 +259,21 @@ def _trace_next_order(
     max_height, far = _MAX_HEIGHT * min_tube_width, 3 * facets.size
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        normal, way = previous.normal[row], far * directions[row]
-        starts = points + ray_offset(facets, normal)[:, None]
-        ends = (starts + way[:, None]).flatten(0, 1)
-        found, along = find_next_surface(occluders, starts.flatten(0, 1), ends)
+        offset, way = ray_offset(facets, previous.normal[row]), far * directions[row]
+        found, along = find_surfaces_along(occluders, points, offset, way)
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
-        own = metal_face[previous.facet[row]].repeat_interleave(points.shape[1])
-        again = torch.nonzero(metal_face[found] == own)[:, 0]
-        at = again // points.shape[1]
-        normal, way, other = normal[at], way[at], facets.normal[found[again]]
-        behind = (along[again] * dot(normal, way) < max_height) & (
+        own = metal_face[previous.facet[row]]
+        at, point = torch.nonzero(metal_face[found] == own[:, None], as_tuple=True)
+        normal, way, other = previous.normal[row[at]], way[at], facets.normal[found[at, point]]
+        length = along[at, point].double()
+        behind = (length * dot(normal, way) < max_height) & (
             dot(other, way) * dot(other, normal) > 0
         )
-        again, way = again[behind], way[behind]
-        starts = starts.flatten(0, 1)[again] + along[again, None] * way
+        at, point, way, length = (column[behind] for column in (at, point, way, length))
+        starts = points[at, point] + offset[at] + length[:, None] * way
         starts = starts + 2 * ray_offset(facets, way / far)
-        found[again] = find_next_surface(occluders, starts, starts + way)[0]
-        return found.view(points.shape[:2])
+        found[at, point] = find_next_surface(occluders, starts, starts + way)[0]
+        return found
 
     def is_flat(row: Tensor, points: Tensor, facet: Tensor) -> Tensor:
         face, d = metal_face[facet], directions[row][:, None]
