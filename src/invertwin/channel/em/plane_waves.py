@@ -126,19 +126,19 @@ def reflect_field(
 
 def scatter_from_metal(
     normal: Vectors, direction: Vectors, field: _Axes, received: _Axes
-) -> tuple[Complex128[Tensor, "row 2 2"], _Axes]:
-    """Amplitudes S per m² and unit wave number of smooth metal, and its reflected field.
+) -> tuple[Float64[Tensor, "row 2 2"], _Axes]:
+    """Amplitudes S per m² of smooth metal over −jk/2π, and its reflected field.
 
-    With F of ``radiate_field`` for a conductor, p·F = −(jk/2π)[(p·d)(n·E) − (p·E)(n·d)].
+    With F of ``radiate_field`` for a conductor, p·F = −(jk/2π) p·[d (n·E) − E (n·d)].
 
     Args:
         normal, direction, field: as in ``reflect_field``, the field real.
         received: receiving polarisations p, transverse to the direction towards the receiver.
     """
-    across = dot(normal[:, None], field)
-    tangential = dot(received[:, :, None], field[:, None]) * dot(normal, direction)[:, None, None]
-    amplitude = dot(received, direction[:, None])[..., None] * across[:, None] - tangential
-    return amplitude * (-0.5j / math.pi), 2 * across[..., None] * normal[:, None] - field
+    across = dot(normal[:, None], field)[..., None]
+    # Products of small matrices are faster than broadcasting over axes of two and three.
+    current = across @ direction[:, None] - dot(normal, direction)[:, None, None] * field
+    return received @ current.mT, 2 * across @ normal[:, None] - field
 
 
 def radiate_field(

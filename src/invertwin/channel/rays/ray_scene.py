@@ -460,34 +460,36 @@ def find_next_surface(
     return face, along.double()
 
 
-def find_surfaces_along(
-    rays: Occluders,
-    points: Float64[Tensor, "row point 3"],
-    offset: Float64[Tensor, "row 3"],
-    way: Float64[Tensor, "row 3"],
-) -> tuple[Int64[Tensor, "row point"], Float32[Tensor, "row point"]]:
-    """Find the first triangles from all points of a row along one segment, in one kernel.
+def prepare_casting(
+    rays: Occluders, offset: Float64[Tensor, "m 3"], way: Float64[Tensor, "m 3"]
+) -> Callable[[Tensor, Tensor], tuple[Int64[Tensor, "row point"], Float32[Tensor, "row point"]]]:
+    """Return a function that finds the first triangles from points along given segments.
+
+    Its arguments are the segment of each row [row], and world points [row, point, 3] in metres. It
+    returns triangle indices (−1: none), and positions along the segments from 0 to 1.
 
     Args:
         rays: occluders.
-        points: world points [m].
         offset: from the points to the segments' starts [m].
         way: from the segments' starts to their ends [m].
-
-    Returns:
-        Triangle indices (−1: none), and positions along the segments from 0 to 1.
     """
-    if not points.numel():
-        shape = points.shape[:2]
-        return torch.zeros(shape, dtype=torch.int64), torch.zeros(shape)
-    lane = dr.arange(mi.UInt32, points.shape[0] * points.shape[1])
-    row = lane // points.shape[1]
-    local = dr.gather(mi.Vector3d, arrays.to_double(rays.origin), mi.UInt32(0))
-    start = dr.gather(mi.Vector3d, arrays.to_double(points), lane)
-    start += dr.gather(mi.Vector3d, arrays.to_double(offset), row)
-    end = start + dr.gather(mi.Vector3d, arrays.to_double(way), row)
-    found = _cast_segments(rays, mi.Point3f(start - local), mi.Point3f(end - local))
-    return found[0].view(points.shape[:2]), found[1].view(points.shape[:2])
+    tables = [arrays.to_double(table) for table in (rays.origin, offset, way)]
+
+    def cast(row: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        rows, count, _ = points.shape
+        if not rows:
+            return torch.zeros(0, count, dtype=torch.int64), torch.zeros(0, count)
+        lane = dr.arange(mi.UInt32, rows * count)
+        segment = dr.gather(mi.UInt32, arrays.to_index(row), lane // count)
+        local, before, ahead = (
+            dr.gather(mi.Vector3d, table, at)
+            for table, at in zip(tables, (mi.UInt32(0), segment, segment), strict=True)
+        )
+        start = dr.gather(mi.Vector3d, arrays.to_double(points), lane) + before
+        found = _cast_segments(rays, mi.Point3f(start - local), mi.Point3f(start + ahead - local))
+        return found[0].view(rows, count), found[1].view(rows, count)
+
+    return cast
 
 
 def _cast_segments(
@@ -499,8 +501,8 @@ def _cast_segments(
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
-    dr.eval(face, along)
-    return arrays.to_torch(face).long(), arrays.to_torch(along)
+    dr.eval(face, along)  # in one kernel
+    return arrays.view_as_torch(face).long(), arrays.view_as_torch(along)
 
 
 def find_passed_sheets(

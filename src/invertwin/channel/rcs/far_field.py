@@ -277,11 +277,11 @@ class _FarFieldTracer:
             for f in members:
                 k = target.wave_numbers[f]
                 if not (target.is_smooth_metal and currents):
-                    skins, scale = target.interfaces[f], 1.0 if target.is_smooth_metal else k
-                    currents = self._patch_amplitudes(patch_orders, solids, skins, scale)
+                    currents = self._patch_amplitudes(patch_orders, solids, target.interfaces[f], k)
                 rows = zip(orders, patch_orders, integrals, currents, strict=False)
                 for order, patches, integral, current in rows:
-                    strength = integral(k) * (k if target.is_smooth_metal else 1.0)
+                    scale = -0.5j * k / math.pi if target.is_smooth_metal else 1.0
+                    strength = integral(k) * scale
                     fields = current * strength[:, None, None]
                     order[f] = order[f].index_add(0, patches.aspect, fields)
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
@@ -319,7 +319,10 @@ class _FarFieldTracer:
         interfaces: plane_waves.SmoothInterfaces,
         k: float,
     ) -> list[Tensor]:
-        """Amplitudes S per m² of all patches, order by order: [row, receive, transmit] each."""
+        """Amplitudes S per m² of all patches, order by order: [row, receive, transmit] each.
+
+        Those of smooth metal are over −jk/2π.
+        """
         found: list[Tensor] = []
         powers: list[float] = []
         reflected = transmitted = torch.zeros(0)
@@ -339,7 +342,7 @@ class _FarFieldTracer:
             wave = patches.normal, patches.direction, field
             if self.target.is_smooth_metal:
                 echo, reflected = plane_waves.scatter_from_metal(*wave, received)
-                found.append(k * echo)
+                found.append(echo)
                 continue
             receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:

@@ -18,7 +18,7 @@ from invertwin.channel.em.plane_waves import dot, reflect_vectors
 from invertwin.channel.rays.ray_scene import (
     Occluders,
     find_next_surface,
-    find_surfaces_along,
+    prepare_casting,
 )
 
 _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
@@ -256,23 +256,22 @@ def _trace_next_order(
 ) -> IlluminatedPatches:
     """Trace the tubes of one order to their next surface."""
     directions = reflect_vectors(previous.direction, previous.normal)
-    max_height, far = _MAX_HEIGHT * min_tube_width, 3 * facets.size
+    max_height, way = _MAX_HEIGHT * min_tube_width, 3 * facets.size * directions
+    offset = ray_offset(facets, previous.normal)
+    own, cast = metal_face[previous.facet], prepare_casting(occluders, offset, way)
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        offset, way = ray_offset(facets, previous.normal[row]), far * directions[row]
-        found, along = find_surfaces_along(occluders, points, offset, way)
+        found, along = cast(row, points)
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
-        own = metal_face[previous.facet[row]]
-        at, point = torch.nonzero(metal_face[found] == own[:, None], as_tuple=True)
-        normal, way, other = previous.normal[row[at]], way[at], facets.normal[found[at, point]]
-        length = along[at, point].double()
-        behind = (length * dot(normal, way) < max_height) & (
-            dot(other, way) * dot(other, normal) > 0
+        at, point = torch.nonzero(metal_face[found] == own[row, None], as_tuple=True)
+        on, other, length = row[at], facets.normal[found[at, point]], along[at, point].double()
+        behind = (length * dot(previous.normal[on], way[on]) < max_height) & (
+            dot(other, way[on]) * dot(other, previous.normal[on]) > 0
         )
-        at, point, way, length = (column[behind] for column in (at, point, way, length))
-        starts = points[at, point] + offset[at] + length[:, None] * way
-        starts = starts + 2 * ray_offset(facets, way / far)
-        found[at, point] = find_next_surface(occluders, starts, starts + way)[0]
+        at, point, on, length = (column[behind] for column in (at, point, on, length))
+        starts = points[at, point] + offset[on] + length[:, None] * way[on]
+        starts = starts + 2 * ray_offset(facets, directions[on])
+        found[at, point] = find_next_surface(occluders, starts, starts + way[on])[0]
         return found
 
     def is_flat(row: Tensor, points: Tensor, facet: Tensor) -> Tensor:
