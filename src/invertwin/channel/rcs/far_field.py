@@ -42,7 +42,7 @@ from invertwin.channel.rcs.surface_paths import face_path_lengths
 from invertwin.checks import is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.runtime.concurrency import torch_threads
+from invertwin.runtime.concurrency import run_alongside, torch_threads
 from invertwin.runtime.progress import track
 from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
@@ -263,28 +263,36 @@ class _FarFieldTracer:
         self, depth: int, tube_width: float | None, boundary: bool
     ) -> dict[str, Tensor]:
         """Physical optics of every order, by beams or, with a tube width, by ray tubes."""
-        target = self.target
         orders = [list(self._zero_amplitudes()) for _ in range(depth)]
-        for patch_orders, solids, members in (
-            self._trace_beam_orders(depth, boundary)
-            if tube_width is None
-            else self._trace_tube_orders(depth, tube_width)
-        ):
-            currents: list[Tensor] = []
-            integrals = [
-                found.phase_integral(self.receivers[found.aspect]) for found in patch_orders
-            ]
-            for f in members:
-                k = target.wave_numbers[f]
-                if not (target.is_smooth_metal and currents):
-                    currents = self._patch_amplitudes(patch_orders, solids, target.interfaces[f], k)
-                rows = zip(orders, patch_orders, integrals, currents, strict=False)
-                for order, patches, integral, current in rows:
-                    scale = -0.5j * k / math.pi if target.is_smooth_metal else 1.0
-                    strength = integral(k) * scale
-                    fields = current * strength[:, None, None]
-                    order[f] = order[f].index_add(0, patches.aspect, fields)
+        add_patches = partial(self._add_patches, orders)
+        if tube_width is None:
+            for batch in self._trace_beam_orders(depth, boundary):
+                add_patches(*batch)
+        else:
+            run_alongside(add_patches, self._trace_tube_orders(depth, tube_width))
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
+
+    def _add_patches(
+        self,
+        orders: Sequence[list[Tensor]],
+        patch_orders: Sequence[IlluminatedPatches],
+        solids: dielectric_solids.DielectricSolids | None,
+        members: Sequence[int],
+    ) -> None:
+        """Add the fields of patches to the amplitudes of each order and frequency."""
+        target = self.target
+        currents: list[Tensor] = []
+        integrals = [found.phase_integral(self.receivers[found.aspect]) for found in patch_orders]
+        for f in members:
+            k = target.wave_numbers[f]
+            if not (target.is_smooth_metal and currents):
+                currents = self._patch_amplitudes(patch_orders, solids, target.interfaces[f], k)
+            rows = zip(orders, patch_orders, integrals, currents, strict=False)
+            for order, patches, integral, current in rows:
+                scale = -0.5j * k / math.pi if target.is_smooth_metal else 1.0
+                strength = integral(k) * scale
+                fields = current * strength[:, None, None]
+                order[f] = order[f].index_add(0, patches.aspect, fields)
 
     def _trace_beam_orders(self, depth: int, boundary: bool) -> Iterator[_PatchOrders]:
         """Trace few facets by clipped beams."""
