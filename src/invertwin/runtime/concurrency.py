@@ -1,7 +1,7 @@
 """Locks and thread counts where torch and the ray tracer work in one process."""
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -30,13 +30,13 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def run_alongside(function: Callable[..., None], items: Iterable[Sequence[Any]]) -> None:
+def run_alongside(function: Callable[[Any], None], items: Iterable[Any]) -> None:
     """Call a function of each item in a second thread, in order, while the next item is made.
 
     At most two items exist at a time.
 
     Args:
-        function: function of the values of an item; not of tensors that ``torch.func`` transforms,
+        function: function of an item; not of tensors that ``torch.func`` transforms,
             whose state is that of one thread.
         items: iterable whose items are worth a thread, such as rays that are traced for each.
     """
@@ -44,5 +44,5 @@ def run_alongside(function: Callable[..., None], items: Iterable[Sequence[Any]])
         last = second.submit(tuple)
         for item in items:
             last.result()
-            last = second.submit(function, *item)
+            last = second.submit(function, item)
         last.result()

@@ -111,7 +111,7 @@ class IlluminatedPatches(Rows):
         difference = scattering_direction - self.wave_vector
         if not difference.is_complex():
             patches = plane_waves.polygon_integral(self.polygon, difference)
-            return lambda k: patches(k) * torch.exp(-1j * k * self.phase_offset)
+            return lambda k: patches(k) * plane_waves.phasor(-k * self.phase_offset)
         # Relative to a corner: far from the origin, decaying waves would overflow.
         start = self.polygon[:, 0]
         patches = plane_waves.polygon_integral(self.polygon - start[:, None], difference)

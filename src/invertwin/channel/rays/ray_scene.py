@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
@@ -144,8 +144,10 @@ class Occluders:
 
     def to_local_points(self, points: Points) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""
-        pairs = zip(points.detach().unbind(1), self.origin, strict=True)
-        return mi.Point3f(*(arrays.to_float(column - start) for column, start in pairs))
+        lanes = dr.arange(mi.UInt32, len(points)), mi.UInt32(0)
+        pairs = zip((points, self.origin), lanes, strict=True)
+        point, start = (dr.gather(mi.Vector3d, arrays.to_double(x), lane) for x, lane in pairs)
+        return mi.Point3f(point - start)
 
 
 class RayScene(Occluders):
@@ -456,53 +458,14 @@ def find_next_surface(
     """
     if not len(start):
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
-    face, along = _cast_segments(rays, rays.to_local_points(start), rays.to_local_points(end))
-    return face, along.double()
-
-
-def prepare_casting(
-    rays: Occluders, offset: Float64[Tensor, "m 3"], way: Float64[Tensor, "m 3"]
-) -> Callable[[Tensor, Tensor], tuple[Int64[Tensor, "row point"], Float32[Tensor, "row point"]]]:
-    """Return a function that finds the first triangles from points along given segments.
-
-    Its arguments are the segment of each row [row], and world points [row, point, 3] in metres. It
-    returns triangle indices (−1: none), and positions along the segments from 0 to 1.
-
-    Args:
-        rays: occluders.
-        offset: from the points to the segments' starts [m].
-        way: from the segments' starts to their ends [m].
-    """
-    tables = [arrays.to_double(table) for table in (rays.origin, offset, way)]
-
-    def cast(row: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        rows, count, _ = points.shape
-        if not rows:
-            return torch.zeros(0, count, dtype=torch.int64), torch.zeros(0, count)
-        lane = dr.arange(mi.UInt32, rows * count)
-        segment = dr.gather(mi.UInt32, arrays.to_index(row), lane // count)
-        local, before, ahead = (
-            dr.gather(mi.Vector3d, table, at)
-            for table, at in zip(tables, (mi.UInt32(0), segment, segment), strict=True)
-        )
-        start = dr.gather(mi.Vector3d, arrays.to_double(points), lane) + before
-        found = _cast_segments(rays, mi.Point3f(start - local), mi.Point3f(start + ahead - local))
-        return found[0].view(rows, count), found[1].view(rows, count)
-
-    return cast
-
-
-def _cast_segments(
-    rays: Occluders, origin: mit.Point3f, end: mit.Point3f
-) -> tuple[Int64[Tensor, " n"], Float32[Tensor, " n"]]:
-    """First triangle on segments between local points (−1: none), and positions along them."""
-    offset = end - origin
+    origin = rays.to_local_points(start)
+    offset = rays.to_local_points(end) - origin
     ray = mi.Ray3f(origin + offset * RAY_EPSILON, mi.Vector3f(offset), 1 - 2 * RAY_EPSILON, 0.0, [])
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
     dr.eval(face, along)  # in one kernel
-    return arrays.view_as_torch(face).long(), arrays.view_as_torch(along)
+    return arrays.view_as_torch(face).long(), arrays.view_as_torch(along).double()
 
 
 def find_passed_sheets(

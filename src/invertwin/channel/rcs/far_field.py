@@ -267,19 +267,14 @@ class _FarFieldTracer:
         add_patches = partial(self._add_patches, orders)
         if tube_width is None:
             for batch in self._trace_beam_orders(depth, boundary):
-                add_patches(*batch)
+                add_patches(batch)
         else:
             run_alongside(add_patches, self._trace_tube_orders(depth, tube_width))
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
-    def _add_patches(
-        self,
-        orders: Sequence[list[Tensor]],
-        patch_orders: Sequence[IlluminatedPatches],
-        solids: dielectric_solids.DielectricSolids | None,
-        members: Sequence[int],
-    ) -> None:
+    def _add_patches(self, orders: Sequence[list[Tensor]], batch: _PatchOrders) -> None:
         """Add the fields of patches to the amplitudes of each order and frequency."""
+        patch_orders, solids, members = batch
         target = self.target
         currents: list[Tensor] = []
         integrals = [found.phase_integral(self.receivers[found.aspect]) for found in patch_orders]
@@ -289,8 +284,7 @@ class _FarFieldTracer:
                 currents = self._patch_amplitudes(patch_orders, solids, target.interfaces[f], k)
             rows = zip(orders, patch_orders, integrals, currents, strict=False)
             for order, patches, integral, current in rows:
-                scale = -0.5j * k / math.pi if target.is_smooth_metal else 1.0
-                strength = integral(k) * scale
+                strength = integral(k) * (-0.5j * k / math.pi if target.is_smooth_metal else 1.0)
                 fields = current * strength[:, None, None]
                 order[f] = order[f].index_add(0, patches.aspect, fields)
 

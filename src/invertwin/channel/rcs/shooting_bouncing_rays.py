@@ -15,11 +15,7 @@ from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Facets, IlluminatedPatches, patches_in_air
 from invertwin.channel.em.plane_waves import dot, reflect_vectors
-from invertwin.channel.rays.ray_scene import (
-    Occluders,
-    find_next_surface,
-    prepare_casting,
-)
+from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
 
 _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
 _CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
@@ -195,7 +191,7 @@ def inset_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 
     """
     a, b, c = corners.unbind(1)
     centre = ((a + b + c) / 3)[:, None]  # a mean over an axis of three is ten times as slow
-    return torch.cat([centre, corners + _CORNER_INSET * (centre - corners)], 1)
+    return torch.cat([centre, torch.lerp(corners, centre, _CORNER_INSET)], 1)
 
 
 def _orient_normals(normal: Tensor, direction: Tensor) -> Tensor:
@@ -258,27 +254,30 @@ def _trace_next_order(
     directions = reflect_vectors(previous.direction, previous.normal)
     max_height, way = _MAX_HEIGHT * min_tube_width, 3 * facets.size * directions
     offset = ray_offset(facets, previous.normal)
-    own, cast = metal_face[previous.facet], prepare_casting(occluders, offset, way)
+    own = metal_face[previous.facet]
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        found, along = cast(row, points)
+        starts = points + offset[row, None]
+        ends = starts + way[row, None]
+        pair = starts.flatten(0, 1), ends.flatten(0, 1)
+        found, along = (x.view(points.shape[:2]) for x in find_next_surface(occluders, *pair))
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
         at, point = torch.nonzero(metal_face[found] == own[row, None], as_tuple=True)
-        on, other, length = row[at], facets.normal[found[at, point]], along[at, point].double()
+        on, other, length = row[at], facets.normal[found[at, point]], along[at, point]
         behind = (length * dot(previous.normal[on], way[on]) < max_height) & (
             dot(other, way[on]) * dot(other, previous.normal[on]) > 0
         )
         at, point, on, length = (column[behind] for column in (at, point, on, length))
-        starts = points[at, point] + offset[on] + length[:, None] * way[on]
+        starts = starts[at, point] + length[:, None] * way[on]
         starts = starts + 2 * ray_offset(facets, directions[on])
         found[at, point] = find_next_surface(occluders, starts, starts + way[on])[0]
         return found
 
     def is_flat(row: Tensor, points: Tensor, facet: Tensor) -> Tensor:
         face, d = metal_face[facet], directions[row][:, None]
-        hits = points + _distance_to_facets(facets, facet, points, d)[..., None] * d
-        centre = facet[:, :1]
-        height = dot(facets.normal[centre], hits - facets.corners[centre, 0]).abs()
+        distance, centre = _distance_to_facets(facets, facet, points, d), facet[:, :1]
+        normal, start = facets.normal[centre], facets.corners[centre, 0]
+        height = (dot(normal, points - start) + distance * dot(normal, d)).abs()
         limit = torch.where(is_narrow(row, 2 * points[:, 1:]), _MAX_HEIGHT, _MAX_UNEVENNESS)
         same = (facet >= 0) & (face == face[:, :1])
         return (same & (height <= limit[:, None] * min_tube_width)).all(1)
