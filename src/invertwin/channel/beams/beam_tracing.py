@@ -109,14 +109,11 @@ class IlluminatedPatches(Rows):
             scattering_direction: unit vectors s towards the receiver.
         """
         difference = scattering_direction - self.wave_vector
-        if not difference.is_complex():
-            patches = plane_waves.polygon_integral(self.polygon, difference)
-            return lambda k: patches(k) * plane_waves.phasor(-k * self.phase_offset)
         # Relative to a corner: far from the origin, decaying waves would overflow.
         start = self.polygon[:, 0]
         patches = plane_waves.polygon_integral(self.polygon - start[:, None], difference)
         phase = plane_waves.dot(difference, start) - self.phase_offset
-        return lambda k: patches(k) * torch.exp(1j * k * phase)
+        return lambda k: patches(k) * plane_waves.phasor(k * phase)
 
 
 def patches_in_air(

@@ -138,16 +138,14 @@ class Occluders:
         ray = mi.Ray3f(start, arrays.to_vectors(mi.Vector3f, direction), most, 0.0, [])
         hit = self.scene.ray_intersect_preliminary(ray)
         face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
-        distance = dr.select(hit.is_valid(), hit.t, dr.inf)
-        dr.eval(face, distance)
-        return arrays.to_torch(face).long(), arrays.to_torch(distance).double()
+        dr.eval(face, hit.t)
+        return arrays.to_torch(face).long(), arrays.to_torch(hit.t).double()
 
     def to_local_points(self, points: Points) -> mit.Point3f:
         """Convert world points [n, 3] to Dr.Jit points about the local origin."""
-        lanes = dr.arange(mi.UInt32, len(points)), mi.UInt32(0)
-        pairs = zip((points, self.origin), lanes, strict=True)
-        point, start = (dr.gather(mi.Vector3d, arrays.to_double(x), lane) for x, lane in pairs)
-        return mi.Point3f(point - start)
+        table, origin = (arrays.to_double(values) for values in (points, self.origin))
+        world = dr.gather(mi.Vector3d, table, dr.arange(mi.UInt32, len(points)))
+        return mi.Point3f(world - dr.gather(mi.Vector3d, origin, mi.UInt32(0)))
 
 
 class RayScene(Occluders):
@@ -463,7 +461,7 @@ def find_next_surface(
     ray = mi.Ray3f(origin + offset * RAY_EPSILON, mi.Vector3f(offset), 1 - 2 * RAY_EPSILON, 0.0, [])
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
-    along = dr.select(hit.is_valid(), hit.t + RAY_EPSILON, 1.0)
+    along = dr.minimum(hit.t + RAY_EPSILON, 1.0)
     dr.eval(face, along)  # in one kernel
     return arrays.view_as_torch(face).long(), arrays.view_as_torch(along).double()
 

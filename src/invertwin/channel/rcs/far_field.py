@@ -13,6 +13,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -42,7 +43,7 @@ from invertwin.channel.rcs.surface_paths import face_path_lengths
 from invertwin.checks import is_differentiated
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.runtime.concurrency import run_alongside, torch_threads
+from invertwin.runtime.concurrency import torch_threads
 from invertwin.runtime.progress import track
 from invertwin.scene.material.fresnel import refractive_index
 from invertwin.scene.scene import Scene
@@ -264,12 +265,20 @@ class _FarFieldTracer:
     ) -> dict[str, Tensor]:
         """Physical optics of every order, by beams or, with a tube width, by ray tubes."""
         orders = [list(self._zero_amplitudes()) for _ in range(depth)]
-        add_patches = partial(self._add_patches, orders)
-        if tube_width is None:
-            for batch in self._trace_beam_orders(depth, boundary):
-                add_patches(batch)
+        batches = self._trace_beam_orders(depth, boundary)
+        if tube_width is not None:
+            batches = self._trace_tube_orders(depth, tube_width)
+        if tube_width is None or not self.target.is_smooth_metal:
+            # Derivatives have a state for each thread.
+            for batch in batches:
+                self._add_patches(orders, batch)
         else:
-            run_alongside(add_patches, self._trace_tube_orders(depth, tube_width))
+            with ThreadPoolExecutor(1) as second:  # adds patches while the next tubes are traced
+                last = second.submit(tuple)
+                for batch in batches:
+                    last.result()
+                    last = second.submit(self._add_patches, orders, batch)
+                last.result()
         return {f"order {n}": torch.stack(order) for n, order in enumerate(orders, start=1)}
 
     def _add_patches(self, orders: Sequence[list[Tensor]], batch: _PatchOrders) -> None:
@@ -290,11 +299,9 @@ class _FarFieldTracer:
 
     def _trace_beam_orders(self, depth: int, boundary: bool) -> Iterator[_PatchOrders]:
         """Trace few facets by clipped beams."""
-        facets, incident = self.target.facets, -self.transmitters
+        waves = self.target.facets, -self.transmitters, depth
         for solids, members in self.target.interiors:
-            found = beam_tracing.trace_beams(
-                facets, incident, depth, boundary=boundary, solids=solids
-            )
+            found = beam_tracing.trace_beams(*waves, boundary=boundary, solids=solids)
             yield list(found), solids, members
 
     def _trace_tube_orders(self, depth: int, tube_width: float) -> Iterator[_PatchOrders]:

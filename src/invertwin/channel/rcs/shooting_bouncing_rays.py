@@ -258,8 +258,7 @@ def _trace_next_order(
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         starts = points + offset[row, None]
-        ends = starts + way[row, None]
-        pair = starts.flatten(0, 1), ends.flatten(0, 1)
+        pair = (x.flatten(0, 1) for x in (starts, starts + way[row, None]))
         found, along = (x.view(points.shape[:2]) for x in find_next_surface(occluders, *pair))
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
         at, point = torch.nonzero(metal_face[found] == own[row, None], as_tuple=True)
@@ -268,8 +267,8 @@ def _trace_next_order(
             dot(other, way[on]) * dot(other, previous.normal[on]) > 0
         )
         at, point, on, length = (column[behind] for column in (at, point, on, length))
-        starts = starts[at, point] + length[:, None] * way[on]
-        starts = starts + 2 * ray_offset(facets, directions[on])
+        ahead = length[:, None] * way[on] + 2 * ray_offset(facets, directions[on])
+        starts = starts[at, point] + ahead
         found[at, point] = find_next_surface(occluders, starts, starts + way[on])[0]
         return found
 
