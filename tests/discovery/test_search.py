@@ -1,7 +1,7 @@
 """Which shapes there are: halves of a shape, other kinds, and the moves that change them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -200,3 +200,73 @@ def test_held_out_frames_add_to_the_evidence(evidence: float, held: float, bette
     # Without held-out frames, or with fewer shapes, the evidence alone decides.
     assert ShapeSearch(fitted, None, grid).is_better([BOX, BOX], [BOX]) == (evidence > 0)
     assert ShapeSearch(fitted, others, grid).is_better([BOX], [BOX, BOX]) == (evidence < 0)
+
+
+class Judged(ShapeLikelihood):
+    """Frames whose evidence is a function of the shapes, and that no fit changes."""
+
+    judge: Callable[[Sequence[ShapeParameters]], float]
+
+    def __init__(self, judge: Callable[[Sequence[ShapeParameters]], float]) -> None:
+        object.__setattr__(self, "judge", judge)
+
+    def evidence(self, shapes: Sequence[ShapeParameters]) -> float:
+        """As judged."""
+        return self.judge(shapes)
+
+    def refine(self, shapes: Sequence[ShapeParameters], steps: int) -> list[ShapeParameters]:
+        """As given."""
+        return list(shapes)
+
+
+def search_judged(judge: Callable[[Sequence[ShapeParameters]], float]) -> ShapeSearch:
+    """A search without an image."""
+    return ShapeSearch(Judged(judge), None, object.__new__(ImageGrid))
+
+
+def test_two_plates_of_one_wall_are_one_at_their_own_yaw():
+    """A box of another yaw would be far wider than the wall."""
+    wall = replace(BOX, width=0.02, length=1.8)
+    c, s = math.cos(BOX.yaw), math.sin(BOX.yaw)
+    ends = [replace(wall, length=0.9, position=(-0.4 + k * c, 0.3 + k * s)) for k in (-0.45, 0.45)]
+
+    def judge(shapes: Sequence[ShapeParameters]) -> float:
+        if len(shapes) == 2:
+            return 100.0
+        return 200.0 * (shapes[0].length > 1.0) - 5000.0 * (shapes[0].width - 0.02)
+
+    (found,) = search_judged(judge).merge_shapes(ends)
+    assert found.position == pytest.approx(wall.position)
+    assert (found.length, found.width) == pytest.approx((1.8, 0.02))
+
+
+@pytest.mark.parametrize(("alone", "merges"), [(30.0, False), (5.0, True)])
+def test_a_false_neighbour_does_not_widen_a_wall(alone: float, merges: bool):
+    """The wide box is likelier than the two, but not than the wall alone."""
+    wall = replace(BOX, length=1.8, width=0.02)
+    ball = ShapeParameters("sphere", (-0.4, 0.6), 0.0, 0.3, 0.3, 0.6)
+
+    def judge(shapes: Sequence[ShapeParameters]) -> float:
+        if len(shapes) == 2:
+            return 10.0
+        return alone if shapes[0] == wall else 12.0 * (shapes[0] != ball)
+
+    assert len(search_judged(judge).merge_shapes([wall, ball])) == 2 - merges
+
+
+def test_a_wall_is_proposed_at_the_bright_part_of_a_wide_group():
+    """Echoes by way of the floor lie behind it, and are weaker."""
+    line = torch.arange(-1.5, 1.51, 0.05, dtype=torch.float64)
+    places, c, s = torch.cartesian_prod(line, line), math.cos(0.4), math.sin(0.4)
+    along, behind = places @ places.new_tensor([c, s]), places @ places.new_tensor([-s, c])
+    seen = (along.abs() < 0.8) & (behind > -0.03) & (behind < 0.4)
+    group = torch.where(seen, (-behind.clamp_min(0.0) / 0.1).exp(), 0.0)
+    nothing = ImageResponse(sparse.csr_matrix((1, len(places))), (1, 1, 1, 1))
+    search = ShapeSearch(Frames((0.0, 0.0)), None, ImageGrid(places, 0.05, nothing, 0.6))
+    walls = [one for one in search.propose_for_group(group) if one.effective_kind == "wall"]
+    assert any(
+        abs(one.yaw - 0.4) < 0.06
+        and one.length == pytest.approx(1.6, abs=0.2)
+        and math.hypot(*one.position) < 0.06
+        for one in walls
+    )

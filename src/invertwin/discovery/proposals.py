@@ -1,7 +1,6 @@
 """Shape proposals from groups of bright image points."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -13,6 +12,7 @@ from invertwin.inversion.initialisation.detections import label_groups
 
 _YAW_COUNT = 45  # candidate yaws of a rectangle over a quarter turn
 _TRIMMED_FRACTION = 0.05  # fraction of the weight beyond each side of a rectangle
+_WALL_THICKNESS = 0.02  # m; its image is as wide as the resolution
 _PERSON_SIZE = 0.32, 0.66, 1.75  # usual length, width and height [m]
 # Minimum extent, and margin of the usual extents [m].
 _MIN_PERSON_EXTENT, _PERSON_MARGIN = 0.12, 0.25
@@ -91,8 +91,8 @@ def _trimmed_ends(coordinates: Tensor, weight: Tensor) -> Tensor:
 def propose_shapes(
     positions: Float64[Tensor, "point 2"], weight: _Values, *, step: float, height: float
 ) -> list[ShapeParameters]:
-    """Propose shapes for bright points: boxes of two yaws, round shapes, and people, vehicles and
-    corner reflectors that fit the extent.
+    """Propose shapes for bright points: boxes and walls of two yaws, round shapes, and people,
+    vehicles and corner reflectors that fit the extent.
 
     Args:
         positions: positions on the ground [point, 2] [m].
@@ -108,12 +108,13 @@ def propose_shapes(
     tightest = max(tried, key=lambda one: one[0][2])
     smallest = min(tried, key=lambda one: float((one[0][1] + step).prod()))
     rows: list[ShapeParameters] = []
-    chosen: Sequence[tuple[tuple[Tensor, Tensor, float], float]] = [tightest, smallest]
-    for (middle, sides, _), turn in chosen:
+    for (middle, sides, _), turn in (tightest, smallest):
         # The image is about one step wider than the object.
         length, width = (max(float(side), 0.02) for side in sides)
         x, y = middle.tolist()
-        rows.append(ShapeParameters("box", (x, y), turn, length, width, 1.5 * height))
+        box = ShapeParameters("box", (x, y), turn, length, width, 1.5 * height)
+        thin = {"width" if length > width else "length": _WALL_THICKNESS}
+        rows += [box, replace(box, **thin)]
     middle, sides, _ = smallest[0]
     spread, (x, y) = max(float(sides.mean()), 0.02), middle.tolist()
     rows.append(ShapeParameters("cylinder", (x, y), 0.0, spread, spread, 1.5 * height))

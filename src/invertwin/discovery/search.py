@@ -28,6 +28,7 @@ _SHORT_FIT_STEPS, _LONG_FIT_STEPS = 25, 50  # steps of short and long fits
 _CORNERS_PER_ROUND = 4  # corner reflectors per round
 _MIN_CORNER_COSINE = 0.8  # minimum cosine to the axis of a corner reflector
 _MAX_FAILED_GROUPS = 3  # consecutive groups without a gain
+_CORE_FRACTIONS = 0.0, 0.9  # of the typical strength of a group: weaker points are left out
 _MIN_GROUP_FRACTION = 1e-3  # relative to the total strength: weaker groups wait for the next round
 
 
@@ -251,14 +252,18 @@ class ShapeSearch:
                 found = [*others, (union, shape)]
 
     def propose_for_group(self, group: Tensor) -> list[ShapeParameters]:
-        """Propose shapes for a group of bright points.
+        """Propose shapes for a group of bright points, and for its brightest points alone.
+
+        Echoes by way of floors and walls widen the group of an object, but not its brightest part.
 
         Args:
             group: strength of every point [m²], zero outside the group.
         """
-        grid = self.image_grid
-        rows = proposals.propose_shapes(grid.positions, group, step=grid.step, height=grid.height)
-        total = float(group.sum())
+        grid, total, rows = self.image_grid, float(group.sum()), list[ShapeParameters]()
+        sizes = {"step": grid.step, "height": grid.height}
+        for fraction in _CORE_FRACTIONS:
+            core = proposals.bright_weights(group, fraction)
+            rows += proposals.propose_shapes(grid.positions, core, **sizes)
         return [replace(row, brightness=max(total / mean_rcs(row), 1e-4)) for row in rows]
 
     def select_best(self, known: Shapes, candidates: Iterable[ShapeParameters]) -> ShapeParameters:
@@ -373,6 +378,9 @@ class ShapeSearch:
     def merge_shapes(self, shapes: Shapes) -> list[ShapeParameters]:
         """Replace two shapes by one box, person or vehicle where that is more likely.
 
+        It must also be likelier than either of them alone: a false neighbour of a wall would widen
+        it, and the wide one be dropped. Boxes at the yaws of the two join parts of a long wall.
+
         Args:
             shapes: fitted shapes.
         """
@@ -385,14 +393,14 @@ class ShapeSearch:
             a, b = min(pairs, key=lambda pair: shape_gap(*pair))
             tried.add((a, b))
             rest = [shape for shape in found if shape is not a and shape is not b]
-            boxes = [enclosing_box((a, b), turn) for turn in _BOX_YAWS]
+            boxes = [enclosing_box((a, b), turn) for turn in (*_BOX_YAWS, a.yaw, b.yaw)]
             smallest = min(boxes, key=lambda box: box.length * box.width)
             options = [*boxes, *proposals.propose_people_and_vehicles(smallest)]
             merged = self.select_best(rest, options)
             if self.evidence([*rest, merged]) < self.evidence(found) - _MAX_EVIDENCE_DEFICIT:
                 continue
             new = self.refine([*rest, merged])
-            if self.is_better(new, found):
+            if all(self.is_better(new, old) for old in (found, [*rest, a], [*rest, b])):
                 found = new
 
 
@@ -495,17 +503,12 @@ def convert_kind(shape: ShapeParameters, kind: str) -> ShapeParameters:
         return shape
     if kind == "box" and shape.is_rectangular:
         return replace(shape, kind="box")
+    tall = 2 * shape.height if shape.has_free_height else shape.height
     if kind == "box":
         side = 0.85 * shape.length
-        high = shape.height if shape.kind == "cylinder" else 2 * shape.height
-        return replace(shape, kind="box", length=side, width=side, height=high)
-    mean = 0.5 * (shape.length + shape.width)
-    across = mean if not shape.is_rectangular else 1.1 * mean
-    high = shape.height
-    if kind == "sphere" and not shape.has_free_height:
-        high = 0.5 * shape.height
-    elif kind == "cylinder" and shape.has_free_height:
-        high = 2 * shape.height
+        return replace(shape, kind="box", length=side, width=side, height=tall)
+    across = (0.55 if shape.is_rectangular else 0.5) * (shape.length + shape.width)
+    high = 0.5 * tall if kind == "sphere" else tall
     return replace(shape, kind=kind, length=across, width=across, height=max(high, 0.05))
 
 
