@@ -84,12 +84,16 @@ def shelf_distance(run, position):
     ],
 )
 def test_each_aim_is_raised_and_said(aim, words, tmp_path, monkeypatch, capsys):
-    text = RUN.replace('measure = "mean"', aim) + STARTS
-    found = place(monkeypatch, tmp_path, text)
-    assert found["aim_before"] == max(found["tried"])
-    assert len(found["tried"]) == 6
+    text = RUN.replace('measure = "mean"', aim).replace("[1.2, 0.3, 0.2]", "[-1.2, 0.3, 0.2]")
+    found = place(monkeypatch, tmp_path, text + STARTS)
+    given, *tried = found["tried"]
+    assert found["aim_before"] == max(tried) >= given
+    assert len(tried) == 6
     assert found["aim_after"] > found["aim_before"]
     assert re.search(rf"transmitter at \([^)]+\) m: {words}", found["answer"])
+    gain = found["aim_after"] - given
+    over = f"{100 * gain:+.0f} points" if "coverage" in aim else f"{gain:+.1f} dB"
+    assert found["answer"].endswith(f" and {over} over the given place")
     assert found["answer"] in " ".join(capsys.readouterr().out.split())
     # An aim has no noise.
     assert found["verdict"] in ("unknown", "at a bound")
@@ -105,6 +109,20 @@ def test_each_aim_is_raised_and_said(aim, words, tmp_path, monkeypatch, capsys):
     assert found["aim_after"] == pytest.approx(float(expected[run.aim.measure]), abs=1e-6)
     for name in ("report.html", "plan.png", "coverage.png", "loss.png"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("aim", ['"mean"', '"worst_tenth"', '"coverage"\nlevel = -30.0'])
+def test_steps_too_long_end_no_worse_than_the_best_place(aim, tmp_path, monkeypatch):
+    """The given place counts among the starts, the start and every step among the ends."""
+    rate = ("rate = 0.15", "rate = 0.4\nfinal_rate = 0.4")
+    text = RUN.replace('"mean"', aim).replace(*rate) + STARTS
+    found = place(monkeypatch, tmp_path, text)
+    assert found["aim_before"] == max(found["tried"]) == found["tried"][0]
+    assert found["aim_after"] >= found["aim_before"]
+    rows = torch.load(tmp_path / "out" / "checkpoint.pt")["progress"]["history"]
+    if aim == '"mean"':  # the loss is the ratio of powers
+        reached = 10 ** ((found["aim_before"] - found["aim_after"]) / 10)
+        assert reached <= min(row["loss"] for row in rows) + 1e-9
 
 
 def test_clear_keeps_the_transmitter_off_the_furniture(tmp_path, monkeypatch):

@@ -132,6 +132,32 @@ def test_the_loss_is_the_weighted_mean_of_the_losses():
     assert fit.history[0]["loss"] == pytest.approx((3 * 5.0 + 1 * 2.0) / 4)
 
 
+class FixedLevel(Level):
+    """The same, with random numbers that belong to the scene."""
+
+    redraws = False
+
+
+@pytest.mark.parametrize(("model", "lowest"), [(FixedLevel(), True), (Level(), False)])
+def test_a_fit_ends_at_its_lowest_loss_if_every_step_sees_the_same_numbers(model, lowest):
+    """Adam overshoots; the square that cannot be met keeps its last loss near the first."""
+    observation = Observation(model, [0.0, -1.0, 0.05], sensor=float64(1.0))
+    found = reconstruct(
+        scene(),
+        observation,
+        Translation("ball", axes="z"),
+        loss=squared,
+        optimizer=Optimizer("adam", rate=0.1, final_rate=0.1),
+        schedule=Schedule(10),
+    )
+    losses = [row["loss"] for row in found.history]
+    end = 1.0 + (float(found.scene["ball"].center[2]) - 0.05) ** 2
+    assert found.status == "budget"
+    assert losses[-1] > min(losses)
+    assert (end == pytest.approx(min(losses), rel=1e-6)) == lowest
+    assert found.loss == pytest.approx(min(losses) if lowest else losses[-1])
+
+
 def test_weights_say_whom_to_believe():
     """Two that contradict each other: the mean of both, by weight."""
 

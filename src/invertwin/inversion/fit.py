@@ -416,23 +416,29 @@ class Fit:
         self.progress = replace(self.progress, best=(step, loss, parameters))
 
     def _select_best(self, status: Status) -> Status:
-        """Load the best parameters, and return ``diverged`` if the fit ends worse than it began."""
+        """Load the best parameters, and return ``diverged`` if the fit ends worse than it began.
+
+        If all steps have compared the same maps, these are the parameters of the lowest loss; else
+        a step may owe its loss to its random numbers, and the last parameters are kept.
+        """
         best = self.progress.best
         if best is None:
             return status
-        ends = {"first": self.progress.first, "best": best[2]}
+        ends = {"best": best[2], "first": self.progress.first}
         if status != "diverged":
             ends["last"] = self.parameters()
         losses = {name: self._loss_at(own, self._selection_loss) for name, own in ends.items()}
         last = losses.get("last", math.inf)
-        if math.isfinite(last) and last <= _MAX_LOSS_INCREASE * losses["first"]:
-            self.modules.load_state_dict(ends["last"])
-            return status
-        # Losses of steps are of the fitted frames only; recompute on the selection frames.
-        kept = min(("first", "best"), key=lambda name: losses[name])
+        rises = not math.isfinite(last) or last > _MAX_LOSS_INCREASE * losses["first"]
+        redraws = self.stage.frames_per_step or any(model.redraws for model in self._models)
+        kept = "last"
+        if rises or (self.is_unblurred(0) and not redraws):
+            # Losses of steps are of the fitted frames only; those here are of the selection frames.
+            kept = min(losses, key=losses.__getitem__)
+            chosen = (self.progress.step, losses[kept], ends[kept])
+            self.progress = replace(self.progress, best=chosen)
         self.modules.load_state_dict(ends[kept])
-        self.progress = replace(self.progress, best=(self.progress.step, losses[kept], ends[kept]))
-        return "diverged"
+        return "diverged" if rises else status
 
     def _has_converged(self, tolerance: float) -> bool:
         """Return whether the unblurred loss, averaged over two windows, no longer falls."""

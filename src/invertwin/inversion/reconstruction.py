@@ -35,7 +35,8 @@ class Reconstruction:
             the start is kept). It states why the fit stopped; ``verdict`` assesses whether it is
             right.
         steps: number of completed steps.
-        loss: final loss; if the fit diverged, the unblurred loss of the best state.
+        loss: loss of the state that is kept, if the fit compared states at its end; else that of
+            the last step.
         result: final maps and simulated realisations of them.
         doubts: evidence against the twin that its maps do not show.
     """
@@ -150,8 +151,8 @@ def reconstruct(
     assert fit is not None
     with torch.no_grad():
         twin, sensors = fit.apply_modules()
-    best = fit.progress.best if status == "diverged" else None
-    final = history[-1]["loss"] if best is None else best[1]
+    best = fit.progress.best  # of the present step if the fit has ended there
+    final = best[1] if best and best[0] == fit.progress.step else history[-1]["loss"]
     return Reconstruction(
         twin, sensors, fit.modules, history, status, len(history), final, FitResult(fit)
     )

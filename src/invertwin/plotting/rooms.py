@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import torch
 from jaxtyping import Float64
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -14,14 +13,12 @@ from invertwin.plotting.figures import PALETTE, legible, numbers, row_of_axes
 from invertwin.scene import Scene
 
 _MARKS = (("*", "#c0143c"), ("+", PALETTE[1]), (".", PALETTE[2]))
-_SPAN = 60.0  # dB below the strongest that are distinguished
 
 
 def floor_plan(
     levels: Mapping[str, Float64[Tensor, "x y"]],
-    corners: tuple[Tensor, Tensor],
+    plane: MapPlane,
     scene: Scene,
-    height: float,
     tx: Float64[Tensor, "3"],
     panel: Float64[Tensor, "3"],
 ) -> Figure:
@@ -29,17 +26,11 @@ def floor_plan(
 
     Args:
         levels: [dB], by title.
-        corners: Of the map; x and y count [m].
-        scene: Its objects are cut at the height.
-        height: z of the map [m].
+        plane: Cells of the maps.
+        scene: Its objects are cut at the height of the plane.
         tx, panel: Where they stand [m].
     """
-    low, high = corners
-    sides = torch.diag(high - low)[:2]
-    middle = torch.cat([low[:2], low.new_tensor([height])])
-    (count,) = {(len(value), value.shape[1]) for value in levels.values()}
-    plane = MapPlane(middle, *sides, count=count)
-    figure = coverage(levels, plane, scene=scene, dynamic_range=_SPAN)
+    figure = coverage(levels, plane, scene=scene)
     for axes, title in zip(figure.axes, levels, strict=False):
         axes.plot(*numbers(tx)[:2], "^", color="white", markeredgecolor="black", label="sender")
         if title != next(iter(levels)):

@@ -203,5 +203,4 @@ def _coverage(problem: Problem, panel: Metasurface) -> Any:
         aim = Coverage.of(seen.scene, seen.tx, points, table.frequency, **how)
         maps = {"without": aim.direct, "with the panel": aim.gain(panel)}
     shown = {n: 10 * g.clamp_min(_FLOOR).log10().view(plane.shape) for n, g in maps.items()}
-    low, high = plane.corner, plane.corner + plane.first + plane.second
-    return plotting.floor_plan(shown, (low, high), seen.scene, height, seen.tx, panel.position)
+    return plotting.floor_plan(shown, plane, seen.scene, seen.tx, panel.position)

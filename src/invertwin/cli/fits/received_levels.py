@@ -297,17 +297,10 @@ def spread_of_ends(run: RunFile, rows: Sequence[Row], best: Row, bars: Mapping[s
     names = [f"transmitter.{axis}" for axis in "xyz"]
     widths = [bars.get(name, math.inf) for name in names]
     inside = [all(abs(x) <= w for x, w in zip(off, widths, strict=True)) for off in near]
-    squares = zip(names, zip(*near, strict=True), strict=True)
     middle = sorted(math.hypot(*off) for off in near)[len(near) // 2]
-    found: Row = {
-        "ends_near": len(near),
-        "ends_within_bars": sum(inside),
-        "spread_of_ends": {
-            name: math.sqrt(sum(x * x for x in column) / len(column))
-            for name, column in squares
-            if name in bars
-        },
-    }
+    columns = zip(names, zip(*near, strict=True), strict=True)
+    spread = {n: math.hypot(*off) / math.sqrt(len(near)) for n, off in columns if n in bars}
+    found: Row = {"ends_near": len(near), "ends_within_bars": sum(inside), "spread_of_ends": spread}
     if not any(inside):
         found["spread_note"] = (
             f"{len(near)} other starts ended within {limit:g} m of the best, none within its error "

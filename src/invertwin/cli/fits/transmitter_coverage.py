@@ -1,5 +1,6 @@
 """Placement of a transmitter: an aim of its map in place of data."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +23,11 @@ from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
+from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.scene import Scene
+from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
 
 _CELLS = 1500  # of a drawn map
@@ -54,14 +57,19 @@ class TransmitterCoverage(ReceivedLevels):
             with prefix_errors("transmitter_starts"):
                 clear = max(run.transmitter_starts.clear, table.clear or 0.0)
                 some = run.transmitter_starts.model_copy(update={"clear": clear})
-                places = some.sample_positions(scene, run.seed)
-        console.print(f"levels of {len(places)} places to start from")
+                places = torch.cat([places, some.sample_positions(scene, run.seed)])
+        numbers = range(1, len(places)) or range(1)
+        with suppress(InputError):  # where the transmitter is may be too near to furniture
+            table.build(None, initial=places[0], scene=scene)
+            numbers = range(len(places))
+        console.print(f"levels of {len(numbers)} places to start from")
         sensors = [place_first(sensor, place) for place in places]
+        seed = derive_seed(derive_seed(run.seed, 0), 0)  # of the fit, so that gains are exact
         with torch.no_grad():
-            levels = [model.predict(scene, sensor, run.seed) for sensor in sensors]
+            levels = [model.predict(scene, sensor, seed) for sensor in sensors]
         tried = [float(aim.evaluate(one)) for one in levels]
         # Where none covers anyone, the one that comes nearest is the best.
-        best = max(range(len(tried)), key=lambda k: (tried[k], -aim.loss(levels[k], levels[k])))
+        best = max(numbers, key=lambda k: (tried[k], -aim.loss(levels[k], levels[k])))
         items = {"": SensorData((levels[best], None), sensors[best])}
         return Problem(run, scene, truth, frozenset(), items, None, self, notes={"tried": tried})
 
@@ -71,12 +79,12 @@ class TransmitterCoverage(ReceivedLevels):
 
     def score_fit(self, problem: Problem, start: Start, found: Reconstruction) -> Row:
         """The aim at the start and at the end, without softness."""
-        run, sensor = problem.run, found.sensors[0]
+        aim = require_section(problem.run, "aim", "a placement")
         with torch.no_grad():
-            levels = radio_map(run, None).predict(found.scene, sensor, run.seed)
-        after = float(require_section(run, "aim", "a placement").evaluate(levels))
-        place, before = problem.first_sensor.sensor.positions[0], max(problem.notes["tried"])
-        return {"start_position": place.tolist(), "aim_before": before, "aim_after": after}
+            ((levels, begun),) = found.result.fit.maps(0)
+        place = problem.first_sensor.sensor.positions[0].tolist()
+        row = {"aim_before": float(aim.evaluate(begun)), "aim_after": float(aim.evaluate(levels))}
+        return {"start_position": place, **row}
 
     def revise_confidence(self, fits: Fits, believed: Row) -> Row:
         """An aim has no noise: nothing to compare the map with, and no error bars."""
@@ -96,28 +104,32 @@ class TransmitterCoverage(ReceivedLevels):
         drawn.append(save_picture(folder, "loss", plotting.convergence(fits.losses)))
         run = fits.problem.run
         label = require_section(run, "aim", "a placement").label(radio_map(run, None).unit)
-        cells = [[label, metrics["aim_before"], metrics["aim_after"]]]
-        reached = ReportTable("Aim", ["aim", "start", "placed"], cells)
+        cells = [[label, metrics["tried"][0], metrics["aim_before"], metrics["aim_after"]]]
+        reached = ReportTable("Aim", ["aim", "given place", "start", "placed"], cells)
         tables = [reached, error_bar_table(metrics, parameter_values(fits))]
-        return Summary(metrics["answer"], quantity_table("Result", metrics), drawn, tables)
+        table = quantity_table("Result", metrics, skip=("loss",))  # of smooth steps
+        return Summary(metrics["answer"], table, drawn, tables)
 
 
 def _describe(fits: Fits) -> str:
     """State the place of the transmitter and its gain, in the units of the run file."""
-    tried, run = fits.problem.notes["tried"], fits.problem.run
+    run, (given, *tried) = fits.problem.run, fits.problem.notes["tried"]
     aim, unit = require_section(run, "aim", "a placement"), radio_map(run, None).unit
-    after, gain = fits.best["aim_after"], fits.best["aim_after"] - fits.best["aim_before"]
-    what = f"{aim.measure.replace('_', ' ')} {after:.1f} {unit}, {gain:+.1f} dB"
+    others = {f"the best of {len(tried)} random places": max(tried)} if tried else {}
+    others, after = {**others, "the given place": given}, fits.best["aim_after"]
     if aim.measure == "coverage":
-        what = f"{aim.label(unit)} {100 * after:.0f} %, {100 * gain:+.0f} points"
+        what = f"{aim.label(unit)} {100 * after:.0f} %"
+        gains = [f"{100 * (after - own):+.0f} points over {name}" for name, own in others.items()]
+    else:
+        what = f"{aim.measure.replace('_', ' ')} {after:.1f} {unit}"
+        gains = [f"{after - own:+.1f} dB over {name}" for name, own in others.items()]
     place = format_place(fits.found.sensors[0].positions[0].tolist())
-    over = f"the best of {len(tried)} random places" if len(tried) > 1 else "the start"
-    return f"transmitter at ({place}) m: {what} over {over}"
+    return f"transmitter at ({place}) m: {what}, {' and '.join(gains)}"
 
 
 def _draw_coverage(fits: Fits) -> Any:
     """Draw the map among the receivers, at the start and where the transmitter belongs."""
-    model, found = radio_map(fits.problem.run, None), fits.found.sensors[0]
+    model, scene, found = radio_map(fits.problem.run, None), fits.found.scene, fits.found.sensors[0]
     at = require_drawn_places(model)
     if isinstance(at, ReceiverPoints):
         low, high = at.positions.amin(0), at.positions.amax(0)
@@ -127,10 +139,9 @@ def _draw_coverage(fits: Fits) -> Any:
     ends = {"start": fits.problem.first_sensor.sensor, "placed": found}
     shown = Transmitters(torch.stack([sensor.positions[0] for sensor in ends.values()]))
     with torch.no_grad():
-        levels = {
-            title: model.predict(fits.found.scene, sensor, fits.problem.run.seed).amax(0)
+        maps = {
+            title: model.predict(scene, sensor, fits.problem.run.seed).amax(0).view(at.shape)
             for title, sensor in ends.items()
         }
-    maps = {title: values.view(at.shape) for title, values in levels.items()}
     label = f"{model.quantity.replace('_', ' ')} [{model.unit}]"
-    return plotting.coverage(maps, at, scene=fits.found.scene, transmitters=shown, label=label)
+    return plotting.coverage(maps, at, scene=scene, transmitters=shown, label=label)

@@ -55,7 +55,7 @@ class TransmitterTable(AntennaTable):
     """Transmitters: one or several, all with the same antenna.
 
     Attributes:
-        positions: m, of each; where a fit of it starts, unless [transmitter_starts] says otherwise
+        positions: m, of each; where a fit of it starts, unless [transmitter_starts] has better places
         power_dbm: sent by each [dBm]
     """
 
@@ -189,14 +189,17 @@ class AimTable(Section):
     def loss(self, levels: Tensor, before: Tensor) -> Tensor:
         """Compute the loss of a fit: the share that is not covered, or a ratio of powers.
 
+        Its steps are smooth where derivatives are recorded; ends of fits are compared as they are.
+
         Args:
             levels: [tx, ...] in decibels.
             before: The same at the start of the fit.
         """
-        value = self.evaluate(levels, _SOFTNESS)
+        softness = _SOFTNESS if torch.is_grad_enabled() else 0.0
+        value = self.evaluate(levels, softness)
         if self.measure == "coverage":
             return 1 - value
-        return 10 ** ((self.evaluate(before, _SOFTNESS) - value) / 10)
+        return 10 ** ((self.evaluate(before, softness) - value) / 10)
 
 
 AnyMap = Annotated[Any, TableOf(RadioMap, MapTable, ("propagation",), checked=False)]
