@@ -90,7 +90,7 @@ def test_each_aim_is_raised_and_said(aim, words, tmp_path, monkeypatch, capsys):
     assert found["aim_before"] == max(tried) >= given
     assert len(tried) == 6
     assert found["aim_after"] > found["aim_before"]
-    assert re.search(rf"transmitter at \([^)]+\) m: {words}", found["answer"])
+    assert re.search(rf"Transmitter at \([^)]+\) m: {words}", found["answer"])
     gain = found["aim_after"] - given
     over = f"{100 * gain:+.0f} points" if "coverage" in aim else f"{gain:+.1f} dB"
     assert found["answer"].endswith(f" and {over} over the given place")

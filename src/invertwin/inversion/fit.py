@@ -233,12 +233,9 @@ class Fit:
 
     def loss_at_start(self) -> float:
         """Return the loss without blur at the initial parameters of the stage."""
-        present = self.parameters()
-        try:
-            first = self.progress.first
-            return self._loss_at(first, lambda: float(self.objective(self.unblurred_maps(0))))
-        finally:
-            self.modules.load_state_dict(present)
+        own = self.copy()
+        first = own.progress.first
+        return own._loss_at(first, lambda: float(own.objective(own.unblurred_maps(0))))
 
     def realisations(self, seed_number: int) -> list[Realisations | None]:
         """Return functions that simulate recordings of the twin, see ``ForwardModel.realisations``.
@@ -409,11 +406,9 @@ class Fit:
     def _keep_if_better(self, loss: float, parameters: dict[str, Tensor]) -> None:
         """Keep the best parameters; a loss without blur takes precedence over one with blur."""
         best, step = self.progress.best, self.progress.step
-        if best is not None:
-            first = self.is_unblurred(step) and not self.is_unblurred(best[0])
-            if not first and loss >= best[1]:
-                return
-        self.progress = replace(self.progress, best=(step, loss, parameters))
+        rank = (not self.is_unblurred(step), loss)
+        if best is None or rank < (not self.is_unblurred(best[0]), best[1]):
+            self.progress = replace(self.progress, best=(step, loss, parameters))
 
     def _select_best(self, status: Status) -> Status:
         """Load the best parameters, and return ``diverged`` if the fit ends worse than it began.

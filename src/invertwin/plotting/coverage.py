@@ -27,10 +27,10 @@ def coverage(
     *,
     derivatives: Mapping[str, Float[Tensor, "first second"]] | None = None,
     scene: Scene | None = None,
-    transmitters: Transmitters | None = None,
+    transmitters: Transmitters | Mapping[str, Transmitters] | None = None,
     label: str = "path gain [dB]",
     derivative_label: str = "∂ path gain [dB/m]",
-    dynamic_range: float = 60.0,
+    dynamic_range: float | None = None,
 ) -> Figure:
     """Maps over the cells of a plane side by side: levels, then derivatives.
 
@@ -43,10 +43,11 @@ def coverage(
         plane: Their cells.
         derivatives: Maps by title.
         scene: Whose edges are drawn.
-        transmitters: What sends.
+        transmitters: What sends, in all maps, or by their titles.
         label: Of the levels, with its unit.
         derivative_label: Of the derivatives, with its unit.
-        dynamic_range: Level of the brightest colour above the darkest.
+        dynamic_range: Level of the brightest colour above the darkest; None = that of the highest
+            level above all but a twentieth of the cells, at most 60 dB.
 
     Raises:
         InputError: No map, or one of other cells.
@@ -64,17 +65,21 @@ def coverage(
     tall = min(max(3.4 * height / width, 1.6), 5.0)
     figure, cells = row_of_axes(count, (1.4 + 3.4 * count, tall + 0.9), sharey=True)
     lines = [] if scene is None else project_edges(scene, plane)
-    marks = None if transmitters is None else _project_to_plane(plane, transmitters.positions)
+    named = isinstance(transmitters, Mapping)
+    senders = transmitters if named else dict.fromkeys([*levels, *rates], transmitters)
     split = len(levels)
-    top = max((float(v.nan_to_num(-1e3).max()) for v in levels.values()), default=0.0)
+    every = torch.cat([values.flatten() for values in (levels or rates).values()])
+    # Cells inside of objects would take most of the colours.
+    low, top = every.double().nanquantile(torch.tensor([0.05, 1.0]).double()).tolist()
+    span = min(60.0, top - low) if dynamic_range is None else dynamic_range
     for part, maps, style, name in (
-        (cells[:split], levels, {"vmin": top - dynamic_range, "vmax": top}, label),
+        (cells[:split], levels, {"vmin": top - span, "vmax": top}, label),
         (cells[split:], rates, signed_colors(rates.values(), _SHARE), derivative_label),
     ):
         image = None
         for axes, (title, values) in zip(part, maps.items(), strict=True):
             image = axes.pcolormesh(grid[..., 0], grid[..., 1], numbers(values), **style)
-            _format_axes(axes, title, plane, lines, marks)
+            _format_axes(axes, title, plane, lines, senders.get(title))
         if image is not None:
             add_colorbar(figure, image, part, name)
     cells[0].set_ylabel(_names(plane)[1], fontsize=8)
@@ -116,10 +121,11 @@ def project_edges(scene: Scene, plane: MapPlane) -> list[NDArray[Any]]:
     return lines
 
 
-def _format_axes(axes: Any, title: str, plane: MapPlane, lines: Any, marks: Any) -> None:
+def _format_axes(axes: Any, title: str, plane: MapPlane, lines: Any, sender: Any) -> None:
     halo = [withStroke(linewidth=1.8, foreground="white", alpha=0.7)]  # seen on dark pages
     axes.add_collection(LineCollection(lines, colors="black", linewidths=0.6, path_effects=halo))
-    if marks is not None:
+    if sender is not None:
+        marks = _project_to_plane(plane, sender.positions)
         axes.plot(marks[:, 0], marks[:, 1], "^", color="#c0143c", markeredgecolor="white")
     axes.set_aspect("equal")
     label_axes(axes, title, _names(plane)[0])

@@ -436,10 +436,8 @@ class Compose(nn.Module):
 
     def values(self) -> dict[str, Tensor]:
         """Return the values of all modules by name, for progress and reports."""
-        merged: dict[str, Tensor] = {}
-        for part in self.parts:
-            merged |= getattr(part, "values", dict)()
-        return merged
+        named = [getattr(part, "values", dict)() for part in self.parts]
+        return {name: value for own in named for name, value in own.items()}
 
 
 def _initial_value(holder: Any, name: str) -> Value:

@@ -45,10 +45,8 @@ def run_coverage(run: RunFile, folder: RunFolder) -> tuple[list[ReportTable], st
     parts: list[Any] = [quantity_table(f"{name} [{unit}]", metrics, label_table="coverage")]
     if isinstance(places, MapPlane):
         maps = {f"transmitter {k}": one for k, one in enumerate(values, 1)}
-        # Cells inside of objects would take most of the colours.
-        span = min(60.0, float(values.max() - values.quantile(0.01)))
-        look: Any = {"label": f"{name} [{unit}]", "dynamic_range": span}
-        figure = plotting.coverage(maps, places, scene=scene, transmitters=sensor, **look)
+        look: Any = {"transmitters": sensor, "label": f"{name} [{unit}]"}
+        figure = plotting.coverage(maps, places, scene=scene, **look)
         parts.insert(0, save_picture(folder, "coverage", figure, "Coverage"))
     title, status = run.title or "Coverage", f"{metrics['answer']}."
     tables = write_report(folder, metrics, title, status, parts, again="simulate", note=run.note)

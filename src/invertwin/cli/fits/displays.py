@@ -16,7 +16,7 @@ from invertwin.errors import InputError
 from invertwin.inversion import Callback, Fit
 from invertwin.links import Metasurface, PropagationSettings, ReceiverPoints, Transmitters
 from invertwin.links.metasurface.coverage import Coverage
-from invertwin.models.radio import RadioMap
+from invertwin.models.radio import CoverageMap, RadioMap
 from invertwin.scene import Scene
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.folders import PARTS
@@ -123,12 +123,15 @@ def make_fit_display(
     names = [name for name in fits.problem.run.fitted_objects if name in start.names]
     more = viewer.scene_layers(start, "start", fitted=names, fitted_only=True)
     layers = [*display.layers, *more, *viewer.ellipsoid_layers(twin, metrics)]
-    for item, sensor in zip(fits.problem.sensor_data.values(), fits.found.sensors, strict=True):
-        if isinstance(sensor, Metasurface):
-            layers += placement_layers(item.recording, sensor)
+    for sensor, own in zip(fits.found.sensors, fits.found.result.fit.observations, strict=True):
+        if isinstance(own.model, CoverageMap):
+            layers += placement_layers(own.model.coverage, sensor)
+        if isinstance(own.model, RadioMap):
+            # Paths would hide the room.
+            layers += [x for x in viewer.link_layers(twin, sensor, own.model) if x.kind == "points"]
     spectra = {viewer.MEASURED: fits.maps["measured"], viewer.SIMULATED: fits.maps["twin"]}
     seen = make_sensor_maps(fits.problem, spectra)
-    return replace(display, layers=layers, steps=steps, maps=seen)
+    return replace(display, layers=layers, steps=steps if names else (), maps=seen)
 
 
 def placement_layers(coverage: Coverage, panel: Metasurface) -> list[viewer.DisplayLayer]:

@@ -25,7 +25,7 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
-from invertwin.links import MapPlane, ReceiverPoints, Transmitters
+from invertwin.links import MapPlane, ReceiverPoints
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder
@@ -88,9 +88,13 @@ class TransmitterCoverage(ReceivedLevels):
 
     def revise_confidence(self, fits: Fits, believed: Row) -> Row:
         """An aim has no noise: nothing to compare the map with, and no error bars."""
-        word = believed["verdict"] if believed["verdict"] == "at a bound" else "unknown"
-        none = "an aim has no noise: there are no error bars"
-        return {"verdict": word, "verdict_reasons": [], "no_error_bars": none}
+        (module,) = fits.found.parameters
+        bounds = [
+            f"{name} is at the end of its range" for name in getattr(module, "at_bounds", list)()
+        ]
+        none = "An aim has no noise: there are no error bars."
+        word = "at a bound" if bounds else "unknown"
+        return {"verdict": word, "verdict_reasons": bounds, "no_error_bars": none}
 
     def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""
@@ -108,7 +112,7 @@ class TransmitterCoverage(ReceivedLevels):
         reached = ReportTable("Aim", ["aim", "given place", "start", "placed"], cells)
         tables = [reached, error_bar_table(metrics, parameter_values(fits))]
         table = quantity_table("Result", metrics, skip=("loss",))  # of smooth steps
-        return Summary(metrics["answer"], table, drawn, tables)
+        return Summary(f"{metrics['answer']}.", table, drawn, tables)
 
 
 def _describe(fits: Fits) -> str:
@@ -124,11 +128,11 @@ def _describe(fits: Fits) -> str:
         what = f"{aim.measure.replace('_', ' ')} {after:.1f} {unit}"
         gains = [f"{after - own:+.1f} dB over {name}" for name, own in others.items()]
     place = format_place(fits.found.sensors[0].positions[0].tolist())
-    return f"transmitter at ({place}) m: {what}, {' and '.join(gains)}"
+    return f"Transmitter at ({place}) m: {what}, {' and '.join(gains)}"
 
 
 def _draw_coverage(fits: Fits) -> Any:
-    """Draw the map among the receivers, at the start and where the transmitter belongs."""
+    """Draw the map among the receivers, of the given place and of the fitted one."""
     model, scene, found = radio_map(fits.problem.run, None), fits.found.scene, fits.found.sensors[0]
     at = require_drawn_places(model)
     if isinstance(at, ReceiverPoints):
@@ -136,12 +140,12 @@ def _draw_coverage(fits: Fits) -> Any:
         side = float((high - low)[:2].prod() / _CELLS) ** 0.5
         at = MapPlane.horizontal(low[:2], high[:2], float((low + high)[2] / 2), side)
         model = replace(model, places=ReceiverPoints(at.centres.reshape(-1, 3)))
-    ends = {"start": fits.problem.first_sensor.sensor, "placed": found}
-    shown = Transmitters(torch.stack([sensor.positions[0] for sensor in ends.values()]))
+    given = require_section(fits.problem.run, "transmitter", "[aim]").build()
+    ends = {"given place": given, "placed": found}
     with torch.no_grad():
         maps = {
             title: model.predict(scene, sensor, fits.problem.run.seed).amax(0).view(at.shape)
             for title, sensor in ends.items()
         }
     label = f"{model.quantity.replace('_', ' ')} [{model.unit}]"
-    return plotting.coverage(maps, at, scene=scene, transmitters=shown, label=label)
+    return plotting.coverage(maps, at, scene=scene, transmitters=ends, label=label)

@@ -55,7 +55,7 @@ class TransmitterTable(AntennaTable):
     """Transmitters: one or several, all with the same antenna.
 
     Attributes:
-        positions: m, of each; where a fit of it starts, unless [transmitter_starts] has better places
+        positions: m, of each; where a fit of it starts, unless [transmitter_starts] has better
         power_dbm: sent by each [dBm]
     """
 
