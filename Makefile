@@ -28,7 +28,7 @@ help:
 	@echo 'make test-docs  pages, tutorials, examples, plugins'
 	@echo 'make test-all   all tests but those that need a GPU, with run-time type checks'
 	@echo 'make test-gpu   those that need a GPU'
-	@echo 'make test-browser  viewer and report in Chromium; screenshots in out/browser'
+	@echo 'make test-browser  viewer, report and site in Chromium; screenshots in out/browser'
 	@echo 'make fuzz       read damaged files of every format for MINUTES=30'
 	@echo 'make lowest     the quick tests with the lowest versions that we allow'
 	@echo 'make wheel      build, check, and run the demo from the wheel in an empty folder'
@@ -58,7 +58,7 @@ test-all: .venv/.dev .venv/.llvm
 test-gpu: .venv/.dev .venv/.llvm
 	$(BIN)/python -m pytest -m gpu
 
-test-browser: .venv/.dev .venv/.llvm .venv/.browser
+test-browser: .venv/.dev .venv/.llvm .venv/.browser .venv/.docs
 	$(BIN)/python -m pytest -m browser tests/browser
 
 fuzz: .venv/.dev

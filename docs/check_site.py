@@ -1,6 +1,8 @@
-"""Check the built site without a network: links lead somewhere, and pages fetch nothing.
+"""Check the built site without a network: links, what pages fetch, buttons that copy code.
 
 Usage: python docs/check_site.py out/docs/html
+
+What needs a browser is in tests/browser/test_site.py.
 """
 
 import re
@@ -29,6 +31,10 @@ def problems(site: Path) -> list[str]:
     found = []
     for file, page in pages.items():
         name = file.relative_to(site)
+        if page.select("div.highlight pre") and not page.select("script[src*='copybutton.js']"):
+            found.append(f"{name}: code without a button that copies it")
+        if page.html is not None and page.html.get("data-default-mode") == "":
+            found.append(f"{name}: no default mode, which browsers report as an error")
         for tag in page.find_all(list(FETCHED)):
             address = str(tag.get(FETCHED[tag.name]) or "")
             if ELSEWHERE.match(address) and "canonical" not in (tag.get("rel") or []):
@@ -52,5 +58,7 @@ def problems(site: Path) -> list[str]:
 
 if __name__ == "__main__":
     found = problems(Path(sys.argv[1]).resolve())
-    print("\n".join(found) or "links and anchors lead somewhere; nothing is fetched")
+    print(
+        "\n".join(found) or "links and anchors lead somewhere; nothing is fetched; code is copied"
+    )
     sys.exit(bool(found))

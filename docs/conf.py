@@ -13,8 +13,19 @@ project = "invertwin"
 author = "The invertwin contributors"
 version = release = invertwin.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "site_directives"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "site_directives",
+]
 exclude_patterns = ["*.py"]
+
+# Copied snippets run: without prompts, and without what they print.
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+copybutton_selector = "div.highlight:not(.output div) > pre"
 
 # Headings have the anchors that they have on GitHub, where these pages are read too.
 myst_heading_anchors = 4
@@ -39,6 +50,9 @@ napoleon_use_rtype = False
 napoleon_attr_annotations = False  # the signature has them
 
 html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_context = {"default_mode": "auto"}  # without it every page reports an invalid mode
 html_title = f"invertwin {version}"
 # Nothing is fetched when a page is read: no fonts, scripts or pictures from elsewhere.
 html_theme_options = {
@@ -48,4 +62,5 @@ html_theme_options = {
     "show_toc_level": 2,
 }
 html_show_sourcelink = True
+html_split_index = True
 copyright = f"{author}, Apache-2.0"

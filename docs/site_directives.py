@@ -1,5 +1,6 @@
 """Directives of the site: run files with what they say of themselves, and menus of rooms."""
 
+import html
 import importlib
 import inspect
 import os
@@ -7,7 +8,9 @@ import re
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+from bs4 import BeautifulSoup  # pyright: ignore[reportMissingImports]
 from docutils import nodes
 from sphinx.application import Sphinx  # pyright: ignore[reportMissingImports]
 from sphinx.util.docutils import SphinxDirective  # pyright: ignore[reportMissingImports]
@@ -15,6 +18,7 @@ from sphinx.util.docutils import SphinxDirective  # pyright: ignore[reportMissin
 import public_names
 
 REPOSITORY = public_names.REPOSITORY
+LONG = 30_000  # characters of a page whose inner sections are folded
 uses = cache(public_names.uses)
 
 
@@ -102,9 +106,45 @@ def shorten(
     return signature and re.sub(r"tensor\([^()]*\)", "tensor(...)", signature), returns
 
 
+def fold(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: object) -> None:
+    """Fold the entries of the reference and the inner sections of long pages.
+
+    Links to what is folded open it, and so does the browser's search in the page.
+    """
+    body = BeautifulSoup(context.get("body", ""), "html.parser")
+    for entry in body.select("dl.py"):
+        if entry.find_parent("dl", class_="py") is None and page.startswith("api/"):
+            first = entry.select_one("dd > p")
+            said = "" if first is None else first.get_text().split(". ")[0].rstrip(".")
+            name = str(entry.dt["id"]).rsplit(".", 1)[-1]
+            text = BeautifulSoup(f"<code>{name}</code> {html.escape(said)}", "html.parser")
+            after = entry.find_next_sibling()
+            used = after is not None and after.get_text().startswith("Used in:")
+            _fold(body, text, [entry, after] if used else [entry])
+    if len(body.get_text()) > LONG and not page.startswith("api/"):
+        for heading in body.find_all("h3") or body.find_all("h2"):
+            section = heading.parent
+            rest = [part for part in section.contents if part is not heading]
+            inner = _fold(body, heading, rest)
+            inner["id"] = section.attrs.pop("id")  # so that links open it
+    context["body"] = str(body)
+
+
+def _fold(body: Any, summary: Any, parts: list[Any]) -> Any:
+    """Put parts under a summary that opens them; return what holds them."""
+    details, inner = body.new_tag("details", **{"class": "folded"}), body.new_tag("div")
+    line = body.new_tag("summary")
+    (summary if summary.parent is not None else parts[0]).insert_before(details)
+    line.append(summary)
+    details.extend([line, inner])
+    inner.extend(parts)
+    return inner
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", escape, priority=100)
     app.connect("autodoc-process-signature", shorten)
+    app.connect("html-page-context", fold)
     app.add_directive("run-files", RunFiles)
     app.add_directive("names", Names)
     return {"parallel_read_safe": True}
