@@ -5,7 +5,6 @@ import json
 import math
 import random
 import socket
-import statistics
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -293,7 +292,7 @@ def test_the_worker_survives_an_exception_and_says_it(viewer):
 def test_fifty_clients_and_a_hundred_slow_ones_hinder_no_good_one(viewer):
     """It is answered within a second, while 1 000 malformed messages come in beside it.
 
-    The median, since a busy machine delays any one answer; `until` fails if one does not come.
+    Nine times of ten, since a busy machine delays some; `until` fails if an answer does not come.
     """
     draw = random.Random(2)
     with ExitStack() as stack:
@@ -321,7 +320,7 @@ def test_fifty_clients_and_a_hundred_slow_ones_hinder_no_good_one(viewer):
             until(lambda value=value: viewer._where.value == f"step {value}")
             assert answered(viewer).status == 200
             times.append(time.monotonic() - begun)
-        assert statistics.median(times) < 1.0
+        assert sorted(times)[-3] < 1.0
 
 
 def test_a_moved_object_has_no_loss_and_no_error_bars_of_the_fit():
