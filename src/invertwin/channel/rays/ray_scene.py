@@ -141,11 +141,16 @@ class Occluders:
         dr.eval(face, hit.t)
         return arrays.to_torch(face).long(), arrays.to_torch(hit.t).double()
 
-    def to_local_points(self, points: Points) -> mit.Point3f:
-        """Convert world points [n, 3] to Dr.Jit points about the local origin."""
+    def to_local_points(self, points: Points, shift: mit.Vector3d | float = 0.0) -> mit.Point3f:
+        """Convert world points to Dr.Jit points about the local origin.
+
+        Args:
+            points: points in the world [m].
+            shift: vector to add to them [m].
+        """
         table, origin = (arrays.to_double(values) for values in (points, self.origin))
         world = dr.gather(mi.Vector3d, table, dr.arange(mi.UInt32, len(points)))
-        return mi.Point3f(world - dr.gather(mi.Vector3d, origin, mi.UInt32(0)))
+        return mi.Point3f(world + shift - dr.gather(mi.Vector3d, origin, mi.UInt32(0)))
 
 
 class RayScene(Occluders):
@@ -457,8 +462,38 @@ def find_next_surface(
     if not len(start):
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.float64)
     origin = rays.to_local_points(start)
-    offset = rays.to_local_points(end) - origin
-    ray = mi.Ray3f(origin + offset * RAY_EPSILON, mi.Vector3f(offset), 1 - 2 * RAY_EPSILON, 0.0, [])
+    return _intersect_segments(rays, origin, rays.to_local_points(end) - origin)
+
+
+def find_surface_ahead(
+    rays: Occluders, points: Float64[Tensor, "n p 3"], row: Tensor, offset: Points, way: Points
+) -> tuple[Int64[Tensor, "n p"], Float64[Tensor, "n p"]]:
+    """Find the first triangle on segments that all points of a row share but for their start.
+
+    Args:
+        rays: occluders.
+        points: points of each row, in the world [m].
+        row: number of each row in the tables ``offset`` and ``way``.
+        offset: offset of the points [m].
+        way: vector from there to the end of the segment [m].
+
+    Returns:
+        Triangle indices (−1: none), and positions along the segments from 0 to 1.
+    """
+    if not len(row):
+        return torch.zeros(points.shape[:2]).long(), torch.zeros(points.shape[:2]).double()
+    lanes = dr.arange(mi.UInt32, points.shape[0] * points.shape[1]) // points.shape[1]
+    number = dr.gather(mi.UInt32, arrays.to_index(row), lanes)
+    shift, ahead = (dr.gather(mi.Vector3d, arrays.to_double(x), number) for x in (offset, way))
+    start = rays.to_local_points(points.flatten(0, 1), shift)
+    face, along = _intersect_segments(rays, start, mi.Point3f(ahead))
+    return face.view(points.shape[:2]), along.view(points.shape[:2])
+
+
+def _intersect_segments(
+    rays: Occluders, start: mit.Point3f, way: mit.Point3f
+) -> tuple[Int64[Tensor, " n"], Float64[Tensor, " n"]]:
+    ray = mi.Ray3f(start + way * RAY_EPSILON, mi.Vector3f(way), 1 - 2 * RAY_EPSILON, 0.0, [])
     hit = rays.scene.ray_intersect_preliminary(ray)
     face = dr.select(hit.is_valid(), mi.Int32(hit.prim_index), -1)
     along = dr.minimum(hit.t + RAY_EPSILON, 1.0)

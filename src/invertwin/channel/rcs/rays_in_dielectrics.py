@@ -22,7 +22,7 @@ from invertwin.channel.em import plane_waves
 from invertwin.channel.em.dielectric_solids import DielectricSolids
 from invertwin.channel.em.plane_waves import area_vector, cross, dot, interpolate_vectors
 from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
-from invertwin.channel.rcs import shooting_bouncing_rays
+from invertwin.channel.rcs import shooting_bouncing_rays as sbr
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.errors import InputError
 from invertwin.scene.material.fresnel import refractive_index
@@ -185,7 +185,7 @@ def _launch_inner_tubes(
         extent = dot(sides, turns).abs() - width[piece] * turns.norm(dim=2)
         return (extent > _MIN_COSINE * width[piece]).any(1)
 
-    piece, corners = shooting_bouncing_rays.split_large_triangles(own.polygon, is_wide)
+    piece, corners = sbr.split_large_triangles(own.polygon, is_wide)
     d = own.direction[piece, None]
     phases = (dot(corners, d) + own.phase_offset[piece, None]).to(torch.complex128)
     area = dot(area_vector(corners), d[:, 0]).abs()
@@ -245,9 +245,7 @@ def _trace_tubes(
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
         shape, many = points.shape[:2], row.repeat_interleave(points.shape[1])
-        starts = (
-            points + shooting_bouncing_rays.ray_offset(facets, left.normal[row])[:, None]
-        ).flatten(0, 1)
+        starts = (points + sbr.ray_offset(facets, left.normal[row])[:, None]).flatten(0, 1)
         medium, ways = left.medium[many], directions_at(row, points).flatten(0, 1)
         return _find_first_facets(facets, occluders, solids, medium, starts, ways).view(shape)
 
@@ -258,12 +256,10 @@ def _trace_tubes(
     def is_narrow(_: Tensor, pieces: Tensor) -> Tensor:
         return (pieces.roll(-1, 1) - pieces).norm(dim=2).amax(1) <= min_tube_width
 
-    row, corners, face = shooting_bouncing_rays.subdivide_triangles(
-        departing.corners, visible_faces, is_narrow
-    )
+    row, corners, face = sbr.subdivide_triangles(departing.corners, visible_faces, is_narrow)
     keep = (face >= 0) & _has_area(facets, corners)
     row, corners, face = row[keep], corners[keep], face[keep]
-    hit = hit_facets(row, shooting_bouncing_rays.inset_points(corners))
+    hit = hit_facets(row, sbr.inset_points(corners))
     is_other_face = (hit < 0) | (surface.face[hit.clamp_min(0)] != face[:, None])
     # A split piece sees its face at least from its centre.
     is_valid = (~is_other_face).any(1)
@@ -295,13 +291,11 @@ def _find_first_facets(
         row = torch.nonzero(is_wrong_side())[:, 0]
         if not len(row):
             break
-        beyond = (along[row] * far)[:, None] * directions[row]
-        beyond = beyond + 2 * shooting_bouncing_rays.ray_offset(facets, directions[row])
+        d = directions[row]
+        beyond = (along[row] * far)[:, None] * d + 2 * sbr.ray_offset(facets, d)
         origins = origins.index_copy(0, row, origins[row] + beyond)
-        ends = origins[row] + far * directions[row]
-        again, along_again = find_next_surface(occluders, origins[row], ends)
-        found = found.index_copy(0, row, again)
-        along = along.index_copy(0, row, along_again)
+        again, length = find_next_surface(occluders, origins[row], origins[row] + far * d)
+        found, along = found.index_copy(0, row, again), along.index_copy(0, row, length)
     return torch.where(is_wrong_side(), -1, found)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from invertwin.channel.beams.beam_tracing import Facets, IlluminatedPatches, patches_in_air
 from invertwin.channel.em.plane_waves import dot, reflect_vectors
-from invertwin.channel.rays.ray_scene import Occluders, find_next_surface
+from invertwin.channel.rays.ray_scene import Occluders, find_next_surface, find_surface_ahead
 
 _MAX_SIDE_RATIO = 8.0  # times the smallest piece: larger triangles are split in advance
 _CORNER_INSET = 0.02  # fraction from a corner to the centre at which the corner is tested
@@ -40,6 +40,26 @@ def find_illuminated_triangles(
         incident: direction d of each wave.
         min_side: side below which pieces are not split [m].
     """
+
+    def illuminate(aspect: Tensor, number: Tensor, corners: Tensor) -> IlluminatedPatches:
+        d = incident[aspect]
+        normal = _orient_normals(facets.normal[number].detach(), d)
+
+        def test_illumination(row: Tensor, points: Tensor) -> Tensor:
+            starts = points + ray_offset(facets, normal[row])[:, None]
+            back = -d[row][:, None].expand_as(starts)
+            lit = is_unoccluded(starts.flatten(0, 1), back.flatten(0, 1))
+            return lit.view(starts.shape[:2]).long()
+
+        row, corners, lit = subdivide_triangles(
+            corners, test_illumination, lambda _, pieces: _longest_sides(pieces) <= min_side
+        )
+        row, corners = row[lit > 0], corners[lit > 0]
+        aspect, number, d = aspect[row], number[row], d[row]
+        normal = _orient_normals(facets.normal[number], d)
+        before = torch.full_like(aspect, -1)
+        return patches_in_air(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+
     number, corners = split_large_triangles(
         facets.corners.detach(),
         lambda _, pieces: _longest_sides(pieces) > _MAX_SIDE_RATIO * min_side,
@@ -49,35 +69,7 @@ def find_illuminated_triangles(
         row = torch.arange(len(number)).repeat(len(waves))
         facing = dot(facets.normal[number[row]].detach(), incident[aspect])
         keep = ((facing < 0) | ~facets.solid[number[row]]) & (facing.abs() > 1e-9)
-        lit = aspect[keep], number[row[keep]], corners[row[keep]]
-        yield _illuminate_triangles(facets, is_unoccluded, incident, min_side, *lit)
-
-
-def _illuminate_triangles(
-    facets: Facets,
-    is_unoccluded: Callable[[Tensor, Tensor], Tensor],
-    incident: Tensor,
-    min_side: float,
-    aspect: Tensor,
-    number: Tensor,
-    corners: Tensor,
-) -> IlluminatedPatches:
-    d = incident[aspect]
-    normal = _orient_normals(facets.normal[number].detach(), d)
-
-    def test_illumination(row: Tensor, points: Tensor) -> Tensor:
-        starts = points + ray_offset(facets, normal[row])[:, None]
-        back = -d[row][:, None].expand_as(starts)
-        return is_unoccluded(starts.flatten(0, 1), back.flatten(0, 1)).view(starts.shape[:2]).long()
-
-    row, corners, lit = subdivide_triangles(
-        corners, test_illumination, lambda _, pieces: _longest_sides(pieces) <= min_side
-    )
-    row, corners = row[lit > 0], corners[lit > 0]
-    aspect, number, d = aspect[row], number[row], d[row]
-    normal = _orient_normals(facets.normal[number], d)
-    before = torch.full_like(aspect, -1)
-    return patches_in_air(aspect, number, normal, d, torch.zeros_like(d[:, 0]), corners, before)
+        yield illuminate(aspect[keep], number[row[keep]], corners[row[keep]])
 
 
 def split_large_triangles(
@@ -189,9 +181,11 @@ def inset_points(corners: Float64[Tensor, "row 3 3"]) -> Float64[Tensor, "row 4 
     Args:
         corners: corners of the triangles [m].
     """
-    a, b, c = corners.unbind(1)
-    centre = ((a + b + c) / 3)[:, None]  # a mean over an axis of three is ten times as slow
-    return torch.cat([centre, torch.lerp(corners, centre, _CORNER_INSET)], 1)
+    weights = torch.full((4, 3), _CORNER_INSET / 3, dtype=corners.dtype)
+    weights[0] = 1 / 3
+    weights[1:].diagonal().add_(1 - _CORNER_INSET)
+    # One product with a matrix of 9 × 12 is seven times as fast as interpolation.
+    return (corners.flatten(1) @ torch.kron(weights, torch.eye(3).to(corners)).T).view(-1, 4, 3)
 
 
 def _orient_normals(normal: Tensor, direction: Tensor) -> Tensor:
@@ -257,9 +251,7 @@ def _trace_next_order(
     own = metal_face[previous.facet]
 
     def hit_facets(row: Tensor, points: Tensor) -> Tensor:
-        starts = points + offset[row, None]
-        pair = (x.flatten(0, 1) for x in (starts, starts + way[row, None]))
-        found, along = (x.view(points.shape[:2]) for x in find_next_surface(occluders, *pair))
+        found, along = find_surface_ahead(occluders, points, row, offset, way)
         # A tube that was kept whole overhangs its facet, and may start behind the neighbours.
         at, point = torch.nonzero(metal_face[found] == own[row, None], as_tuple=True)
         on, other, length = row[at], facets.normal[found[at, point]], along[at, point]
@@ -267,19 +259,21 @@ def _trace_next_order(
             dot(other, way[on]) * dot(other, previous.normal[on]) > 0
         )
         at, point, on, length = (column[behind] for column in (at, point, on, length))
-        ahead = length[:, None] * way[on] + 2 * ray_offset(facets, directions[on])
-        starts = starts[at, point] + ahead
+        starts = points[at, point] + offset[on] + length[:, None] * way[on]
+        starts += 2 * ray_offset(facets, directions[on])
         found[at, point] = find_next_surface(occluders, starts, starts + way[on])[0]
         return found
 
     def is_flat(row: Tensor, points: Tensor, facet: Tensor) -> Tensor:
-        face, d = metal_face[facet], directions[row][:, None]
-        distance, centre = _distance_to_facets(facets, facet, points, d), facet[:, :1]
-        normal, start = facets.normal[centre], facets.corners[centre, 0]
-        height = (dot(normal, points - start) + distance * dot(normal, d)).abs()
+        face = metal_face[facet]
+        flat = ((facet >= 0) & (face == face[:, :1])).all(1)
+        row, points, facet = row[flat], points[flat], facet[flat]
+        d, centre = directions[row][:, None], facet[:, :1]
+        normal, distance = facets.normal[centre], _distance_to_facets(facets, facet, points, d)
+        height = dot(normal, points - facets.corners[centre, 0]) + distance * dot(normal, d)
         limit = torch.where(is_narrow(row, 2 * points[:, 1:]), _MAX_HEIGHT, _MAX_UNEVENNESS)
-        same = (facet >= 0) & (face == face[:, :1])
-        return (same & (height <= limit[:, None] * min_tube_width)).all(1)
+        flat[flat.clone()] = (height.abs() <= limit[:, None] * min_tube_width).all(1)
+        return flat
 
     def is_narrow(row: Tensor, pieces: Tensor) -> Tensor:
         d = directions[row][:, None]
