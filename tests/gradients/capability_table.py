@@ -43,6 +43,7 @@ depolarisation         S 0 S 0 R S 0 R R 0 0 S 0 0
 density                S 0 - - R R R R 0 R R R R R
 range bias             S 0 S 0 - - - - - - - - - -
 clock offset           S S S S - - - - - - - - - -
+reverberant tail       - - - - - - - - - - S - - -
 object velocity        R R R R R R - R R S 0 R 0 0
 antenna pattern        R R R R R R - R R - - - - -
 antenna polarisation   R R R R R R - R R - - - - -

@@ -34,7 +34,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings, gradcheck
 from invertwin.inversion.gradcheck.lines import make_line
-from invertwin.links import CellSampling, MapPlane, PropagationSettings, Transmitters
+from invertwin.links import CellSampling, MapPlane, PropagationSettings, Reverberation, Transmitters
 from invertwin.links.metasurface.panel import Metasurface, panel_response
 from invertwin.models.camera import DepthMap, SilhouetteMap
 from invertwin.models.radar import SurrogateMap
@@ -342,10 +342,16 @@ CELLS_BEHIND = MapPlane(
 )
 
 
-def covered(scene: Scene, place: Tensor, sampling: CellSampling, seed: int = 0) -> Tensor:
+def covered(
+    scene: Scene,
+    place: Tensor,
+    sampling: CellSampling,
+    seed: int = 0,
+    tail: Reverberation | None = None,
+) -> Tensor:
     """Mean power in cells, seen directly and by the mirror of the wall."""
     cells = replace(CELLS_BEHIND, sampling=sampling)
-    mast = Transmitters(place + float64([0.19, -0.07, 0.04]))
+    mast = Transmitters(place + float64([0.19, -0.07, 0.04]), reverberation=tail)
     return cells.link_statistics(
         scene, mast, PropagationSettings(1e9, depth=1, rays=None), seed
     ).gain
@@ -361,6 +367,9 @@ def coverage_case(parameter: str) -> Found:
         if parameter == "object velocity":
             moved = scene.replace("wall", velocity=theta * float64([1.0, 0.3, 0.2]))
             return covered(moved, radar.positions[0], sampling, seed)
+        if parameter == "reverberant tail":
+            tail = Reverberation(-55.0 + theta, 20e-9 * (1 + theta))
+            return covered(scene, radar.positions[0], sampling, seed, tail)
         changed = MOVES[parameter](scene, radar, theta)
         return covered(changed[0], changed[1].positions[0], sampling, seed)
 
@@ -584,7 +593,7 @@ def case(parameter: str, mechanism: str) -> Found:
 
 def test_the_table_is_whole():
     named = {parameter for parameter, _ in CELLS}
-    assert named == {*MOVES, "range bias", "clock offset", *REFUSALS}
+    assert named == {*MOVES, "range bias", "clock offset", "reverberant tail", *REFUSALS}
     assert len(CELLS) == len(MECHANISMS) * len(named)
     assert set(CELLS.values()) == {"supported", "zero", "refused", "–"}
 

@@ -92,8 +92,8 @@ NO_CASE = {
     **dict.fromkeys(
         (
             *("PropagationSettings.frequency_responses", "PropagationSettings.gains_and_moments"),
-            *("PropagationSettings.link_statistics", "PropagationSettings.rough_moments"),
-            *("PropagationSettings.panel_and_rough_moments", "PropagationSettings.trace_links"),
+            *("PropagationSettings.link_statistics", "PropagationSettings.diffuse_moments"),
+            *("PropagationSettings.panel_and_diffuse_moments", "PropagationSettings.trace_links"),
             *("ReceiverLocations.link_statistics", "ReceiverPoints.link_statistics"),
             *("panel_paths", "panel_response"),
         ),

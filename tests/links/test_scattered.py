@@ -98,7 +98,9 @@ def test_pattern_of_receivers_has_axes_of_its_own():
     reception = PropagationSettings(FREQUENCY, receivers=horn, rough=ONE_BOUNCE)
     isotropic = replace(horn, array=AntennaArray(float64([[0.0, 0.0, 0.0]])))
     plain = PropagationSettings(FREQUENCY, receivers=isotropic, rough=ONE_BOUNCE)
-    powers = [float(how.rough_moments(WALL, MAST, place, 0)[0, 0, 0]) for how in (plain, reception)]
+    powers = [
+        float(how.diffuse_moments(WALL, MAST, place, 0)[0, 0, 0]) for how in (plain, reception)
+    ]
     whole, seen = summed(place[0])[0], summed(place[0], gain)[0]
     # The polarisation is the same for both, so the ratio is that of the pattern alone.
     assert powers[1] / powers[0] == pytest.approx(seen / whole, rel=5e-3)
@@ -112,7 +114,7 @@ def test_smooth_share_mirrors_and_the_rest_scatters():
     metal = Scene({"wall": Object(level_plate(4.0, 4.0), PerfectConductor())})
     reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
     gains = {
-        name: float(reception.rough_moments(scene, MAST, SPOTS, 0)[0, 0, 0])
+        name: float(reception.diffuse_moments(scene, MAST, SPOTS, 0)[0, 0, 0])
         for name, scene in {"all": WALL, "half": half, "none": metal}.items()
     }
     assert gains["half"] == pytest.approx(0.36 * gains["all"], rel=1e-5)
@@ -159,10 +161,10 @@ def test_a_map_with_scattered_power_is_random():
 
 def test_batches_of_places_add_up_to_the_same(monkeypatch):
     reception = PropagationSettings(FREQUENCY, rough=ONE_BOUNCE)
-    whole = reception.rough_moments(WALL, MAST, SPOTS, 0)
+    whole = reception.diffuse_moments(WALL, MAST, SPOTS, 0)
     monkeypatch.setattr(scattered_module, "_POSITIONS_PER_BATCH", 1)
     torch.testing.assert_close(
-        reception.rough_moments(WALL, MAST, SPOTS, 0), whole, rtol=5e-3, atol=0
+        reception.diffuse_moments(WALL, MAST, SPOTS, 0), whole, rtol=5e-3, atol=0
     )
 
 
@@ -196,7 +198,7 @@ def mixed(
     """Power of paths that scatter once and are mirrored too, and its moments over excess delay."""
     sampling = replace(ONE_BOUNCE, **how)
     found = [
-        PropagationSettings(FREQUENCY, depth=d, rays=None, rough=sampling).rough_moments(
+        PropagationSettings(FREQUENCY, depth=d, rays=None, rough=sampling).diffuse_moments(
             scene, Transmitters(tx), places, seed
         )[0]
         for d in (depth, 1)
@@ -241,7 +243,7 @@ def test_energy_that_meets_a_rough_plate_leaves_it_again():
     reception = PropagationSettings(
         FREQUENCY, depth=3, rays=None, rough=replace(ONE_BOUNCE, samples=1_600_000)
     )
-    gain = reception.rough_moments(scene, Transmitters(tx), sphere, 0)[0, :, 0]
+    gain = reception.diffuse_moments(scene, Transmitters(tx), sphere, 0)[0, :, 0]
     left = float(gain.mean()) * 4 * math.pi / WAVELENGTH**2 * 4 * math.pi * radius**2
     assert left == pytest.approx(arrived, rel=0.01)
 
@@ -267,7 +269,7 @@ def test_what_heights_take_off_the_mirror_is_scattered():
 
     def total(height: Tensor, depth: int) -> Tensor:
         how = PropagationSettings(FREQUENCY, depth=depth, rays=None, rough=ONE_BOUNCE)
-        return how.rough_moments(scene(height), MAST, place, 0).sum((0, 1))[0]
+        return how.diffuse_moments(scene(height), MAST, place, 0).sum((0, 1))[0]
 
     surface = RoughConductor(scattering=0.0, rms_slope=0.3).scattering_law(FREQUENCY)
 
@@ -314,7 +316,7 @@ def test_derivative_by_the_size_of_a_mirror():
         mirror = Object(glass, PerfectConductor(), rigid(translation=[3.0, 0.0, 1.2]))
         scene = Scene({"wall": WALL.objects["wall"], "mirror": mirror})
         reception = PropagationSettings(FREQUENCY, depth=3, rays=None, rough=sampling)
-        return reception.rough_moments(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]
+        return reception.diffuse_moments(scene, MAST, float64([[-1.0, -0.5, 1.5]]), 0)[0, 0, 0]
 
     def rate(sampling: Sampling) -> float:
         return float(jvp(lambda x: total(x, sampling), (at,), (torch.ones_like(at),))[1])
@@ -333,8 +335,8 @@ def test_surfaces_that_meet_and_move_are_refused_by_name():
     sampling = Sampling(depth=1, samples=1000, boundary_samples=1000)
     reception = PropagationSettings(FREQUENCY, depth=2, rays=None, rough=sampling)
     with pytest.raises(InputError, match="box and wall in contact; leave a gap"):
-        reception.rough_moments(scene, MAST, SPOTS, 0)
+        reception.diffuse_moments(scene, MAST, SPOTS, 0)
     reception = replace(reception, rough=replace(sampling, contacts=False))
-    reception.rough_moments(scene, MAST, SPOTS, 0).sum().backward()
+    reception.diffuse_moments(scene, MAST, SPOTS, 0).sum().backward()
     assert at.grad is not None
     assert bool(at.grad.isfinite())

@@ -198,9 +198,7 @@ class _ImageRenderer:
         return flat.index_add(0, line * camera.width + column, added)
 
 
-def _clip_segments(
-    ends: Float64[Tensor, "2 piece 3"], camera: Camera, size: Tensor
-) -> tuple[Float64[Tensor, " piece"], Float64[Tensor, " piece"]]:
+def _clip_segments(ends: Tensor, camera: Camera, size: Tensor) -> tuple[Tensor, Tensor]:
     """Return the interval of each segment in front of the camera and inside its image, 0 to 1."""
     x, y, z = ends.unbind(2)
     u, v = camera.principal_point

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float64
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -336,9 +336,7 @@ def _search_range(capture: Capture, range_max: float | None) -> tuple[float, flo
     return first, min(limit, float(grid.ranges[loud[-1]]) + _MARGIN_CELLS * cell)
 
 
-def _relate_to_noise(
-    power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
-) -> tuple[Float64[Tensor, " range"], float, str]:
+def _relate_to_noise(power: Tensor, radar: Radar, grid: Grid) -> tuple[Tensor, float, str]:
     """Return the strongest bin of each range over the noise, what chance reaches, and a note."""
     # Noise level: a running minimum over range.
     strongest = power.amax((0, 2, 3)).double()
@@ -349,9 +347,7 @@ def _relate_to_noise(
     return strongest, chance, _NOTES["no_signal"].format(*places, *levels)
 
 
-def _estimate_background(
-    power: Float[Tensor, "frame range u v"], radar: Radar, grid: Grid
-) -> Float64[Tensor, " range"]:
+def _estimate_background(power: Tensor, radar: Radar, grid: Grid) -> Tensor:
     directions = likelihoods.count_bins_per_draw(likelihoods.direction_axes(radar, grid))
     return likelihoods.estimate_background(power, directions)
 
@@ -398,9 +394,7 @@ def image_points(
     return places[near], cell
 
 
-def _count_views(
-    radar: Radar, positions: Float64[Tensor, "point 3"], scene: Scene | None
-) -> Int64[Tensor, " point"]:
+def _count_views(radar: Radar, positions: Tensor, scene: Scene | None) -> Tensor:
     """Count the radar positions that see each point past all objects."""
     total = torch.zeros(len(positions), dtype=torch.int64)
     for place, axis in _boresights(radar):

@@ -170,9 +170,7 @@ class GaussNewton:
     def zero_grad(self) -> None:
         """Do nothing: gradients are not stored in the parameters."""
 
-    def _solve_step(
-        self, curvature: Tensor, gradient: Tensor, trust_radius: Tensor
-    ) -> Float64[Tensor, " p"]:
+    def _solve_step(self, curvature: Tensor, gradient: Tensor, trust_radius: Tensor) -> Tensor:
         """Minimise the damped quadratic model within the trust radius of every parameter."""
         own = curvature.diagonal()
         # Weakly determined parameters get the mean damping; noise would move them otherwise.

@@ -22,9 +22,11 @@ from invertwin.links.responses import frequency_response as frequency_response
 from invertwin.links.responses import impulse_response as impulse_response
 from invertwin.links.responses import ofdm_channel as ofdm_channel
 from invertwin.links.responses import path_amplitudes as path_amplitudes
+from invertwin.links.reverberation import Reverberation as Reverberation
 from invertwin.links.spreads import angle_spread as angle_spread
 from invertwin.links.spreads import delay_spread as delay_spread
 from invertwin.links.spreads import rician_factor as rician_factor
+from invertwin.links.transmitters import ReverberationParameters as ReverberationParameters
 from invertwin.links.transmitters import TransmitterPosition as TransmitterPosition
 from invertwin.links.transmitters import Transmitters as Transmitters
 

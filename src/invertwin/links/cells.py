@@ -152,7 +152,7 @@ class Cells(ReceiverLocations):
             row = part.tx * mean.shape[1] + cell
             density = part.amount / self.areas[cell, None]
             mean = mean.flatten(0, 1).index_add(0, row, density).view(mean.shape)
-        aside = propagation.panel_and_rough_moments(scene, sensor, points.flatten(0, 1), seed)
+        aside = propagation.panel_and_diffuse_moments(scene, sensor, points.flatten(0, 1), seed)
         mean = mean + aside.unflatten(1, points.shape[:2]).mean(2)
         shape, spread = (len(mean), *self.shape), delay_spread_from_moments(mean)
         return LinkStatistics(mean[..., 0].reshape(shape), spread.reshape(shape))

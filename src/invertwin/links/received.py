@@ -141,7 +141,7 @@ class PropagationSettings:
             return gain.T, self.sum_moments(paths, sensor, batch)
 
         gain, moments = evaluate_in_batches(evaluate_batch, positions)
-        more = self.rough_moments(scene, sensor, positions, seed)
+        more = self.diffuse_moments(scene, sensor, positions, seed)
         return gain + more[..., 0], moments + more
 
     def path_moments(
@@ -175,10 +175,10 @@ class PropagationSettings:
         each = self.path_moments(paths, sensor.positions, positions, sensor.mount)
         return sum_over_paths(paths, each)
 
-    def panel_and_rough_moments(
+    def panel_and_diffuse_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
-        """Sums of ``moments`` of paths that ``trace_coverage`` lacks: panels, rough surfaces.
+        """Sums of ``moments`` of what ``trace_coverage`` lacks: panels, rough surfaces, tails.
 
         Args:
             scene: Propagation environment.
@@ -191,13 +191,13 @@ class PropagationSettings:
             over = panel_paths(scene, self.panels, sensor.positions, batch, self.frequency)
             return (self.sum_moments(over, sensor, batch),)
 
-        total = self.rough_moments(scene, sensor, positions, seed)
+        total = self.diffuse_moments(scene, sensor, positions, seed)
         return total + evaluate_in_batches(evaluate_batch, positions)[0] if self.panels else total
 
-    def rough_moments(
+    def diffuse_moments(
         self, scene: Scene, sensor: Transmitters, positions: Float64[Tensor, "place 3"], seed: int
     ) -> Float64[Tensor, "tx place 3"]:
-        """Sums of ``moments`` over paths scattered by rough surfaces; 0 if these are left out.
+        """Sums of ``moments`` over paths scattered by rough surfaces, and of the reverberant tail.
 
         Args:
             scene: Scene with rough surfaces.
@@ -205,10 +205,12 @@ class PropagationSettings:
             positions: Positions of the receivers [m].
             seed: Seed of the paths that are drawn.
         """
-        if self.rough is None:
-            return positions.new_zeros(len(sensor.positions), len(positions), 3)
-        link = scene, sensor, self.receivers, positions, self.frequency
-        return scattered_moments(*link, self.rough, seed, depth=self.depth, rays=self.rays)
+        found = positions.new_zeros(len(sensor.positions), len(positions), 3)
+        if self.rough is not None:
+            link = scene, sensor, self.receivers, positions, self.frequency
+            found = scattered_moments(*link, self.rough, seed, depth=self.depth, rays=self.rays)
+        tail = sensor.reverberation
+        return found if tail is None else found + tail.link_moments(sensor.positions, positions)
 
     def frequency_responses(
         self,

@@ -116,9 +116,7 @@ def _build_link(
     return channel.Link(*poses, *patterns, SPEED_OF_LIGHT / frequency, False, *polarisations)
 
 
-def _delay_moments(
-    power: Float64[Tensor, "place bin"], grid: channel.Grid, link: channel.Link
-) -> Tensor:
+def _delay_moments(power: Tensor, grid: channel.Grid, link: channel.Link) -> Tensor:
     """Sums of power, of power × excess delay and of power × its square."""
     excess = (2 * grid.ranges - (link.rx - link.tx).norm(dim=1, keepdim=True)) / SPEED_OF_LIGHT
     # A path lies in three bins, with weights whose second moment is a quarter of a squared step.

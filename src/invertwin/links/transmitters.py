@@ -1,4 +1,4 @@
-"""Transmitters with positions, antennas and powers, and modules that move them."""
+"""Transmitters with positions, antennas and powers, and modules with their parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,6 +11,7 @@ from invertwin.checks import ArrayLike, checked_rows, checked_tensor, set_fields
 from invertwin.errors import InputError
 from invertwin.limits import Axes, NonNegative
 from invertwin.links.responses import AntennaMount
+from invertwin.links.reverberation import NEPERS_PER_DB, Reverberation
 from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
 
@@ -23,6 +24,7 @@ class Transmitters:
         positions: Positions [tx, 3], or [3] of a single one, in world axes [m]. Differentiable.
         mount: Antenna mount at each position; the power is the mean over its elements.
         power_dbm: Transmitted power [dBm], one value for all transmitters or one for each.
+        reverberation: Reverberant tail of the room around them; None = without.
 
     Raises:
         InputError: Wrong shapes, NaN, or no transmitter.
@@ -31,6 +33,7 @@ class Transmitters:
     positions: Float64[Tensor, "*tx 3"]
     mount: AntennaMount = field(default_factory=AntennaMount)
     power_dbm: float | Float64[Tensor, " tx"] = 0.0
+    reverberation: Reverberation | None = None
 
     def __post_init__(self) -> None:
         do = "give x, y, z, or a row of them for each"
@@ -55,7 +58,8 @@ class Transmitters:
         rows, terminals = torch.as_tensor(chosen), self.mount
         if terminals.rotations.ndim == 3:
             terminals = replace(terminals, rotations=terminals.rotations[rows])
-        return Transmitters(self.positions[rows], terminals, torch.as_tensor(self.power_dbm)[rows])
+        powers = torch.as_tensor(self.power_dbm)[rows]
+        return replace(self, positions=self.positions[rows], mount=terminals, power_dbm=powers)
 
 
 class FreeSpace:
@@ -201,3 +205,48 @@ class TransmitterPosition(nn.Module):
         place = self.raw_position.detach()
         near = ((place <= self._box[0]) | (place >= self._box[1])).tolist()
         return [f"transmitter.{axis}" for axis, at in zip("xyz", near, strict=True) if at]
+
+
+class ReverberationParameters(nn.Module):
+    """Module Transmitters → Transmitters with gain and decay of a reverberant tail as parameters.
+
+    Args:
+        gain_db: Initial path gain of the tail at distance 0 [dB].
+        decay: Initial time constant [s].
+
+    Attributes:
+        log_gain: Parameter, natural logarithm of the gain.
+        log_decay: Parameter, natural logarithm of the time constant in seconds.
+
+    Raises:
+        InputError: A decay that is not positive.
+    """
+
+    def __init__(self, gain_db: float = -60.0, decay: float = 20e-9) -> None:
+        super().__init__()
+        tail = Reverberation(gain_db, decay)
+        self.log_gain = nn.Parameter(NEPERS_PER_DB * torch.as_tensor(tail.gain_db))
+        self.log_decay = nn.Parameter(torch.as_tensor(tail.decay).log())
+
+    @property
+    def reverberation(self) -> Reverberation:
+        """Reverberant tail."""
+        return Reverberation(self.log_gain / NEPERS_PER_DB, self.log_decay.exp())
+
+    def forward(self, sensor: Transmitters) -> Transmitters:
+        """Return the transmitters with the tail."""
+        return replace(sensor, reverberation=self.reverberation)
+
+    def values(self) -> dict[str, Tensor]:
+        """Gain [dB] and decay [s] by name, for progress and reports."""
+        return {f"reverberation.{n}": v.detach() for n, v in vars(self.reverberation).items()}
+
+    def coordinates(self) -> list[Coordinate]:
+        """Gain [dB] and decay [s]."""
+        slopes = torch.tensor(NEPERS_PER_DB), 1 / self.log_decay.detach().exp()
+        return [
+            Coordinate("reverberation.gain", "dB", {"log_gain": slopes[0]}, 3.0),
+            Coordinate(
+                "reverberation.decay", "s", {"log_decay": slopes[1]}, 0.3 / float(slopes[1])
+            ),
+        ]

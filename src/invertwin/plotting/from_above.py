@@ -70,9 +70,7 @@ def _points(shown: Scene | Tensor, *, corners: bool) -> Tensor:
     return shown.detach().cpu()
 
 
-def _project(
-    power: Float[Tensor, "frame range u v"], grid: Grid, radar: Radar, plane: MapPlane
-) -> Float[Tensor, "first second"]:
+def _project(power: Tensor, grid: Grid, radar: Radar, plane: MapPlane) -> Tensor:
     """Return the power of the cells of a plane in dB below its peak; NaN where none sees."""
     total = torch.full(plane.shape, torch.nan, dtype=torch.float64)
     flat, turns = power.detach().double().cpu().sum(3), radar.link().rotations

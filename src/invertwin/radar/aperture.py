@@ -137,9 +137,7 @@ def _aperture(key: tuple[tuple[float, ...], ...], wavelength: float, window: str
 # Depth of an array along boresight, in wavelengths, that (u, v) steering may neglect.
 
 
-def _distinct_positions(
-    positions: Float64[Tensor, " virtual"], wavelength: float
-) -> tuple[Float64[Tensor, " place"], Int64[Tensor, " virtual"]]:
+def _distinct_positions(positions: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
     """Return distinct positions to a thousandth of a wavelength, and the index of each element."""
     ordered, order = positions.sort()
     groups = torch.cat([torch.zeros(1), (ordered.diff() > 1e-3 * wavelength)]).cumsum(0).long()

@@ -133,9 +133,7 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
     return Capture.from_beat(beat, _set_range_origin(device, source, radar, center))
 
 
-def _select_band(
-    frequencies: _Frequencies, beat: Complex128[Tensor, "frame tx rx sample"], band: Any
-) -> tuple[Float64[Tensor, " part"], Complex128[Tensor, "frame tx rx part"]]:
+def _select_band(frequencies: _Frequencies, beat: Tensor, band: Any) -> tuple[Tensor, Tensor]:
     """Select the frequencies within a band [Hz], and their samples."""
     if band is None:
         return frequencies, beat

@@ -223,9 +223,7 @@ def _segment_medium(
     return index, attenuation
 
 
-def _interpolate_table(
-    table: Float64[Tensor, "row cos"], row: _Numbers, cosine: Float64[Tensor, " n"]
-) -> Float64[Tensor, " n"]:
+def _interpolate_table(table: Tensor, row: _Numbers, cosine: Tensor) -> Tensor:
     """A table over |cosθ|, linear between its entries."""
     entries = table.shape[1]
     t = cosine.abs().clamp_max(1.0) * (entries - 1)

@@ -456,9 +456,7 @@ def scattered_power(
     return whole + (1 - 2 * depolarisation) * (q + u) - (1 - 4 * depolarisation) * v
 
 
-def _stokes(
-    legs: RayPaths, fields: Complex128[Tensor, "path element 2"]
-) -> Float64[Tensor, "path 4"]:
+def _stokes(legs: RayPaths, fields: Tensor) -> Tensor:
     """Mean Stokes parameters, over the elements of an antenna, at the far ends of legs."""
     field = torch.einsum("pij,pej->pei", legs.coefficient, fields)
     power = torch.view_as_real(field).square().sum(-1)
@@ -482,9 +480,7 @@ def _material_points_at(
     return radar_equation.MaterialPoints(position, normal, one, geometry.face_surface[face])
 
 
-def _require_no_contact(
-    geometry: Geometry, stage: PathScene, is_scattering: Bool[Tensor, " f"]
-) -> None:
+def _require_no_contact(geometry: Geometry, stage: PathScene, is_scattering: Tensor) -> None:
     """Raise an error for derivatives where a moving surface touches or intersects a rough one."""
     axes = torch.eye(3, dtype=torch.float64)[None]
     wavelength = SPEED_OF_LIGHT / stage.frequency

@@ -194,17 +194,13 @@ class _CloudRays:
         between = rx[:, None] + depth[..., None] * direction[:, None]
         return (self._interpolate_density(between) * length).sum(1).reshape(points.shape[:2])
 
-    def _interpolate_density(
-        self, points: Float64[Tensor, "ray step 3"]
-    ) -> Float64[Tensor, "ray step"]:
+    def _interpolate_density(self, points: Tensor) -> Tensor:
         position = 2 * (points - self.cloud.low) / (self.cloud.high - self.cloud.low) - 1
         found = _Trilinear.apply(self.cloud.density, position.reshape(-1, 3))
         return found.reshape(points.shape[:2])
 
 
-def _interpolate_trilinear(
-    values: Float64[Tensor, "x y z"], positions: Float64[Tensor, "n 3"]
-) -> Tensor:
+def _interpolate_trilinear(values: Tensor, positions: Tensor) -> Tensor:
     """Interpolate between the nodes of a grid that spans [-1, 1] along each axis."""
     nodes = positions.flip(-1)[None, :, None, None]  # grid_sample counts axes from the last one
     found = grid_sample(values[None, None], nodes, padding_mode="border", align_corners=True)

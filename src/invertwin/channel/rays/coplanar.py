@@ -158,9 +158,7 @@ def _ray_tolerance(points: Float64[Tensor, "*n 3"]) -> Float64[Tensor, "*n"]:
     return ray_scene.RAY_EPSILON * points.norm(dim=-1) + 1e-9
 
 
-def _pair_coplanar_triangles(
-    triangles: Float64[Tensor, "n 3 3"], owners: Int64[Tensor, " n"]
-) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
+def _pair_coplanar_triangles(triangles: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
     """Pair triangles whose planes have the same distance from the origin, on the same side."""
     normal = triangle_normals(triangles)
     largest = normal.gather(1, normal.abs().argmax(1, keepdim=True))
@@ -176,9 +174,7 @@ def _pair_coplanar_triangles(
     return order[first], order[first + 1 + chosen - (sums - counts)[first]]
 
 
-def _has_near_neighbour(
-    offsets: Float64[Tensor, " n"], owner: Int64[Tensor, " n"], max_distance: Tensor
-) -> Bool[Tensor, " n"]:
+def _has_near_neighbour(offsets: Tensor, owner: Tensor, max_distance: Tensor) -> Tensor:
     """Find the sorted numbers with one of another owner within reach."""
     change = (owner[1:] != owner[:-1]).nonzero()[:, 0]  # the last number of every run
     if not len(change):
@@ -211,11 +207,7 @@ def _find_common_points(
 
 
 def _is_any_visible(
-    rays: ray_scene.Occluders,
-    points: Float64[Tensor, "n 3"],
-    normal: Float64[Tensor, "n 3"],
-    viewers: Float64[Tensor, "m 3"],
-    sheets: Bool[Tensor, " face"],
+    rays: ray_scene.Occluders, points: Tensor, normal: Tensor, viewers: Tensor, sheets: Tensor
 ) -> bool:
     """Test whether a viewer sees any of some points, also through sheets.
 

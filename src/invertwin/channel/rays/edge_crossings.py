@@ -69,9 +69,7 @@ def split_at_crossings(
     return replace(pieces, start=starts[after], end=ends[before])
 
 
-def _crossing_shares(
-    wedges: Wedges, crossings: Int64[Tensor, "n 2"], corners: Float64[Tensor, "facet 3 3"]
-) -> Float64[Tensor, " n"]:
+def _crossing_shares(wedges: Wedges, crossings: Tensor, corners: Tensor) -> Tensor:
     """Positions along edges, 0 to 1, at which they meet the planes of triangles."""
     edge, face = crossings.T
     a, b, c = corners[face].unbind(1)

@@ -139,9 +139,7 @@ def find_intersection_curves(rays: RayScene) -> IntersectionCurves | None:
     return concatenate_rows(parts)
 
 
-def _trace_edges(
-    rays: RayScene, edges: _Numbers, extended: Bool[Tensor, " n"]
-) -> tuple[Int64[Tensor, " m"], Int64[Tensor, " m"]]:
+def _trace_edges(rays: RayScene, edges: _Numbers, extended: Tensor) -> tuple[Tensor, Tensor]:
     """Find intersections of edges with triangles; some edges are extended beyond their ends."""
     # In both directions, so that neither of two close surfaces hides the other.
     edge = to_index(torch.cat([edges, edges[extended]]))
@@ -219,9 +217,7 @@ def intersect_triangles(
     return IntersectionCurves(first, second, start, end, touching, edge)
 
 
-def _line_interval(
-    triangle: Float64[Tensor, "n 3 3"], height: Float64[Tensor, "n 3"], line: Float64[Tensor, "n 3"]
-) -> tuple[Tensor, Tensor, Tensor]:
+def _line_interval(triangle: Tensor, height: Tensor, line: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the interval of a line within triangles of a common plane, and a point of it."""
     places, there = [*triangle.unbind(1)], [*(height == 0).unbind(1)]
     for i, j in ((0, 1), (1, 2), (2, 0)):

@@ -28,7 +28,7 @@ from invertwin.storage.run_folder import RunFolder
 OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
 AMONG_CLUTTER, FROM_IMAGE = "among_clutter", "from_image"
 WITH_PERMITTIVITIES = "with_permittivities"
-OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "panel", "panel_phases")
+OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "reverberation", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
 HISTORIES = ("losses", "curve", "checkpoint", "screened")
 """Keys of rows that metrics.json leaves out."""

@@ -11,7 +11,7 @@ from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.schema.fits import SamplingBase
 from invertwin.cli.schema.sensors import Orientation, PolarisationValue
 from invertwin.limits import Count, NonNegative
-from invertwin.links import AntennaMount, PropagationSettings, Transmitters
+from invertwin.links import AntennaMount, PropagationSettings, Reverberation, Transmitters
 from invertwin.links.metasurface.coverage import soft_quantile
 from invertwin.links.transmitters import FreeSpace
 from invertwin.models.radio import RadioMap
@@ -21,6 +21,9 @@ from invertwin.scene import AntennaArray, Scene
 
 _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
 _SOFTNESS = 2.0  # dB, width of the smooth tenth and of the level of coverage in a fit
+
+
+ReverberationTable: Any = registry.constructor_table(Reverberation, "Reverberation")
 
 
 class AntennaTable(Section):
@@ -57,15 +60,18 @@ class TransmitterTable(AntennaTable):
     Attributes:
         positions: m, of each; where a fit of it starts, unless [transmitter_starts] has better
         power_dbm: sent by each [dBm]
+        reverberation: tail of the room around them; without it none
     """
 
     positions: Annotated[list[Vector], MinLen(1)]
     power_dbm: float = 0.0
+    reverberation: ReverberationTable | None = None
 
     def build(self) -> Transmitters:
         """The transmitters."""
         places = torch.tensor(self.positions, dtype=torch.float64)
-        return Transmitters(places, self.build_mount(places), self.power_dbm)
+        tail = None if self.reverberation is None else self.reverberation.build()
+        return Transmitters(places, self.build_mount(places), self.power_dbm, tail)
 
 
 PropagationBase: Any = registry.constructor_table(

@@ -73,6 +73,7 @@ def register(registry: Registry) -> None:
     registry.add("places", "mesh", mesh_cells)
     registry.add("data", "received", ReceivedData)
     registry.add("data", "received_file", ReceivedFile)
+    registry.add("parameter", "reverberation", links.ReverberationParameters)
     registry.add(
         "parameter",
         "transmitter",

@@ -57,9 +57,7 @@ def exact_spectrum(
     return beamform(range_profile(beat, radar, grid), radar, grid)
 
 
-def _separable_power(
-    channels: Complex[Tensor, "frame virtual range"], array: Aperture, grid: Grid
-) -> Float[Tensor, "frame range u v"]:
+def _separable_power(channels: Tensor, array: Aperture, grid: Grid) -> Tensor:
     plane = array.plane(channels.movedim(1, -1))
 
     def steer(cosines: Tensor, places: Tensor, weight: Tensor) -> Tensor:

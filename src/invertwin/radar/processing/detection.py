@@ -302,9 +302,7 @@ def _ordered_factor(cells: int, rank: int, false_alarm: float, looks: int) -> fl
     return float(brentq(excess, 0.0, high, xtol=1e-9 * high))  # type: ignore[arg-type]
 
 
-def _refinement(
-    power: Float64[Tensor, "frame velocity range u v"], cell: list[Tensor], axis: int, wrap: bool
-) -> _Values:
+def _refinement(power: Tensor, cell: list[Tensor], axis: int, wrap: bool) -> _Values:
     """Return the sub-bin peak offset along one axis, within half a bin, 0 at an edge."""
     size, here = power.shape[axis], cell[axis]
 

@@ -286,17 +286,13 @@ def frame_spectrogram(
     return replace(found, power=found.power.mean((1, 2)).sum(1))
 
 
-def _steer_beams(
-    spectrum: Complex[Tensor, "frame velocity tx rx range"], radar: Radar, grid: Grid
-) -> Float[Tensor, "frame velocity range u v"]:
+def _steer_beams(spectrum: Tensor, radar: Radar, grid: Grid) -> Tensor:
     frames, count = spectrum.shape[:2]
     power = beamform(spectrum.flatten(0, 1), _repeat_poses(radar, count), grid)
     return power.unflatten(0, (frames, count))
 
 
-def _doppler_transform(
-    slow: Complex[Tensor, "*batch chirp"], window: str, bins: int
-) -> Complex[Tensor, "*batch velocity"]:
+def _doppler_transform(slow: Tensor, window: str, bins: int) -> Tensor:
     weight = unit_window(window, slow.shape[-1]).to(slow.device, slow.real.dtype)
     return torch.fft.fftshift(torch.fft.fft(slow * weight, bins), dim=-1)
 

@@ -170,9 +170,7 @@ def _sidelobe_powers(
     return found[0], found[1]
 
 
-def _resolve_directions(
-    cell: Complex128[Tensor, "tx rx"], radar: Radar, grid: Grid, noise: float
-) -> list[list[float]]:
+def _resolve_directions(cell: Tensor, radar: Radar, grid: Grid, noise: float) -> list[list[float]]:
     """Return directions u, v and powers in one cell, the strongest first."""
     channels, left = cell.flatten(), cell
     one = replace(grid, range_start=0.0, range_count=1)

@@ -275,9 +275,7 @@ class ChirpTrain:
             span = span + times.to(drift)[:, None, None] * drift
         return torch.stack([self.trajectory(time) for time in times.tolist()]), span
 
-    def _scattering_points(
-        self, points: Float64[Tensor, "instant path 3"], receiver: Float64[Tensor, "3"]
-    ) -> Float64[Tensor, "instant path 3"]:
+    def _scattering_points(self, points: Tensor, receiver: Tensor) -> Tensor:
         """Return the points at the scattering times of the signals received at the instants."""
         if len(points) == 1:
             return points

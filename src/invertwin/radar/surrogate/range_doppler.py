@@ -4,7 +4,7 @@ import math
 from itertools import combinations
 
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from invertwin.channel import Grid, Paths
@@ -112,9 +112,7 @@ def _doppler_response(cycles: Tensor, chirps: Chirps, window: str) -> Tensor:
     return interpolate_response(cycles, 1 / chirps.count, response)
 
 
-def _beam_weights(
-    direction: Tensor, radar: Radar, grid: Grid
-) -> Complex128[Tensor, "tx path direction"]:
+def _beam_weights(direction: Tensor, radar: Radar, grid: Grid) -> Tensor:
     """Return the contributions of each transmitter's elements to the beams for a unit field."""
     array = aperture(radar)
     array.check_directions(grid)

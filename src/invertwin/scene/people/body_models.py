@@ -69,9 +69,7 @@ def _parts() -> list[tuple[str, Tensor, Tensor, float, float]]:
     return parts
 
 
-def _cone(
-    points: Tensor, start: Tensor, end: Tensor, first: float, last: float
-) -> Float64[Tensor, " p"]:
+def _cone(points: Tensor, start: Tensor, end: Tensor, first: float, last: float) -> Tensor:
     """Return the approximate distance to a cone with round ends, negative inside."""
     axis = end - start
     share = ((points - start) @ axis / axis.square().sum()).clamp(0.0, 1.0)
