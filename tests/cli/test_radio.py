@@ -116,6 +116,23 @@ def test_levels_of_a_file(tmp_path, monkeypatch):
     assert place == pytest.approx([1.0, 0.8, 0.2], abs=0.02)
 
 
+def test_the_tail_of_a_room_is_found(tmp_path, monkeypatch):
+    tail = "reverberation = { gain_db = -48.0, decay = 15e-9 }"
+    own = '[[parameters]]\nkind = "reverberation"\ngain_db = -58.0\ndecay = 30e-9\n\n'
+    begin, end = RUN.index("[[parameters]]"), RUN.index("[optimizer]")
+    text = RUN[:begin] + own + RUN[end : RUN.index("[variants")]
+    text = text.replace("[map]\n", f"{tail}\n\n[map]\n").replace("noise = 0.5", "noise = 0.1")
+    text = text.replace("scatter = 0.5", "scatter = 0.1")
+    text = text.replace("positions = [[1.5, -0.9, 0.3]]\n", "").replace("depth = 2\nrays", "rays")
+    out = tmp_path / "found"
+    assert call(monkeypatch, "reconstruct", file_of(tmp_path, text), "--out", out) == 0
+    found = read_metrics(out)
+    values, bars = found["parameters"], found["standard_deviations"]
+    assert abs(values["reverberation.gain"] + 48.0) < 4 * bars["reverberation.gain"]
+    assert abs(values["reverberation.decay"] - 15e-9) < 4 * bars["reverberation.decay"]
+    assert 0 < bars["reverberation.decay"] < 5e-9
+
+
 def test_a_run_file_as_used_compares_levels_as_the_first_one_did(tmp_path):
     run = loaded(tmp_path, RUN)
     again = loaded(tmp_path, to_toml(run))

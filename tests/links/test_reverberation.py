@@ -125,7 +125,7 @@ def test_a_fit_finds_gain_and_decay():
 def test_values_carry_their_names():
     module = ReverberationParameters(-60.0, 25e-9)
     values = module.values()
-    assert float(values["reverberation.gain_db"]) == pytest.approx(-60.0)
+    assert float(values["reverberation.gain"]) == pytest.approx(-60.0)
     assert float(values["reverberation.decay"]) == pytest.approx(25e-9)
 
 

@@ -239,7 +239,8 @@ class ReverberationParameters(nn.Module):
 
     def values(self) -> dict[str, Tensor]:
         """Gain [dB] and decay [s] by name, for progress and reports."""
-        return {f"reverberation.{n}": v.detach() for n, v in vars(self.reverberation).items()}
+        values = (torch.as_tensor(value).detach() for value in vars(self.reverberation).values())
+        return dict(zip(("reverberation.gain", "reverberation.decay"), values, strict=True))
 
     def coordinates(self) -> list[Coordinate]:
         """Gain [dB] and decay [s]."""
