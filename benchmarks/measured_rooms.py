@@ -4,15 +4,17 @@
 
 The *world* stands for a measurement: three rooms in a row with doors and walls of unknown
 materials, twelve pieces of furniture of wood and metal, four transmitters below the ceiling, forty
-receivers. Paths go over up to four surfaces or over one edge, and eighty scatterers are joined by a
+receivers. Paths meet up to four surfaces or one edge, and eighty scatterers are joined by a
 propagation graph, by which the rooms reverberate (Pedersen, Steinböck and Fleury, "Modeling of
 reverberant radio channels using propagation graphs", IEEE Transactions on Antennas and Propagation
-60(12), 2012; here a bounce leaves g² of the power, not g² over the number of edges). Levels have errors of 1 dB and a common offset of −4 to 4 dB. Delay spreads are those
-of the power delay profile within 25 dB of its peak, as channel sounders state them.
+60(12), 2012; here a bounce leaves g² of the power, not g² over the number of edges). Levels have
+errors of 1 dB and a common offset of −4 to 4 dB. Delay spreads are those of the power delay profile
+within 25 dB of its peak, as channel sounders state them.
 
 The *twin* knows the walls alone, starts with the middle of the range of each material, and traces
-two interactions. A fifth of the receivers gives it the materials, the sent power, and gain and
-decay of a reverberant tail (`invertwin.links.ReverberationParameters`). Prints a table and writes
+paths that meet up to four surfaces, passed walls included. A fifth of the receivers gives it the
+materials, the sent power, and gain and decay of a reverberant tail
+(`invertwin.links.ReverberationParameters`). Prints a table and writes
 `metrics.json` into DIR (default `out/measured_rooms`). All errors are of the other links:
 
 - `level_ratio`: root mean square error of levels over that of a power law of distance that is
@@ -59,7 +61,7 @@ MATERIALS = ((4.0, 8.0), (3.0, 5.0), (2.2, 3.5)), ((0.03, 0.2), (0.02, 0.1), (0.
 DOOR, FURNITURE = 1.0, 12
 SENDERS, RECEIVERS, EACH = 4, 40, 5  # each fifth receiver calibrates
 DYNAMIC_RANGE_DB, FLOOR = 25.0, 1e-11
-HOW = PropagationSettings(FREQUENCY, BANDWIDTH, depth=2, rays=None)
+HOW = PropagationSettings(FREQUENCY, BANDWIDTH, depth=4, rays=20_000)
 STEPS, SPREAD_WEIGHT = 25, 10.0
 SCATTERERS, GRAPH_GAIN, IS_EDGE = 80, 0.7, 0.8  # the last: probability of an edge
 REQUIRED: Required = {"level_ratio": ("<=", 0.7), "spread_factor": ("<=", 1.3)}

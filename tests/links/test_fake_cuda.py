@@ -106,6 +106,8 @@ NO_CASE = {
             *("MapPlane.find_cells", "MapPlane.horizontal", "MapPlane.sample_points"),
             *("MapPlane.surface", "Metasurface.focus", "ReceiverLocations.fixed_visibility"),
             *("ReceiverLocations.with_sample_count", "TransmitterPosition.at_bounds"),
+            *("Reverberation.link_moments", "ReverberationParameters.coordinates"),
+            *("ReverberationParameters.forward", "ReverberationParameters.values"),
             *("TransmitterPosition.coordinates", "TransmitterPosition.forward"),
             *("TransmitterPosition.values", "Transmitters.frames", "WallPath.locate"),
         ),
