@@ -218,7 +218,7 @@ def calibrate(world: World, scene: Scene) -> tuple[Scene, Transmitters]:
     """Fit the materials of a twin, and its reverberant tail."""
     chosen, sensor = world.chosen, Transmitters(world.tx)
     places, tail = ReceiverPoints(world.rx[chosen]), ReverberationParameters()
-    both = {"sensor": sensor, "parameters": tail}
+    both: dict[str, Any] = {"sensor": sensor, "parameters": tail}
     power = iw.SpectrumLoss("mse", levels=1, gain="one", background="level")
     gains, delays = (iw.RadioMap(places, HOW, what) for what in ("path_gain", "delay_spread"))
     found = iw.reconstruct(

@@ -23,9 +23,6 @@ _MAX_DRAWS = 10_000  # places that are drawn, before that is given up
 _SOFTNESS = 2.0  # dB, width of the smooth tenth and of the level of coverage in a fit
 
 
-ReverberationTable: Any = registry.constructor_table(Reverberation, "Reverberation")
-
-
 class AntennaTable(Section):
     """An antenna of one element.
 
@@ -65,7 +62,7 @@ class TransmitterTable(AntennaTable):
 
     positions: Annotated[list[Vector], MinLen(1)]
     power_dbm: float = 0.0
-    reverberation: ReverberationTable | None = None
+    reverberation: Annotated[Any, TableOf(Reverberation)] | None = None
 
     def build(self) -> Transmitters:
         """The transmitters."""
