@@ -144,7 +144,8 @@ def test_scripts_fit_exact_or_recorded_signals(name):
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and re.search(
-            r"(Capture\.(from_beat|from_range_profile|load)|read|richer\.link_statistics|photograph)$",
+            r"(Capture\.(from_beat|from_range_profile|load)|read|photograph|draw_world"
+            r"|(richer|replace\(how, depth=3\))\.link_statistics)$",
             ast.unparse(node.func),
         )
     ]

@@ -466,14 +466,14 @@ def find_next_surface(
 
 
 def find_surface_ahead(
-    rays: Occluders, points: Float64[Tensor, "n p 3"], row: Tensor, offset: Points, way: Points
+    rays: Occluders, points: Float64[Tensor, "n p 3"], row: Tensor, offset: Tensor, way: Tensor
 ) -> tuple[Int64[Tensor, "n p"], Float64[Tensor, "n p"]]:
     """Find the first triangle on segments that all points of a row share but for their start.
 
     Args:
         rays: occluders.
         points: points of each row, in the world [m].
-        row: number of each row in the tables ``offset`` and ``way``.
+        row: number of each row in the tables ``offset`` and ``way`` [m, 3].
         offset: offset of the points [m].
         way: vector from there to the end of the segment [m].
 

@@ -294,9 +294,7 @@ def body_joints(
     return scenes.SkinnedBody.from_mesh(object, body, mesh, joints)
 
 
-def shape_regularizers(
-    table: Any, module: nn.Module, scene: scenes.Scene | Radar
-) -> list[Regularizer]:
+def shape_regularizers(table: Any, module: nn.Module, scene: object) -> list[Regularizer]:
     """Terms of the loss that keep a fitted shape, or a path, plausible."""
     if isinstance(scene, scenes.Scene) and table.kind == "vertices" and table.laplacian > 0:
         return [Laplacian(scene, table.object, table.laplacian)]
