@@ -154,8 +154,10 @@ def test_the_legend_names_the_roles_that_there_are():
 
 def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
     none = np.zeros((0, 3), np.float32)
-    names = {"paths: <b>": (1, 2, 3), "levels/low": (4, 5, 6), "levels/high": (7, 8, 9)}
+    bands = {"levels/-90 to -80 dBm": (4, 5, 6), "levels/-80 to -72.5 dBm": (7, 8, 9)}
+    names = {"paths: <b>": (1, 2, 3), **bands}
     layers = [DisplayLayer(name, "surface", none, color=color) for name, color in names.items()]
     text = legend_html(Display("title", layers))
     assert "paths: &lt;b&gt;" in text
-    assert 'rgb(4, 5, 6)">■</span><span style="color: rgb(7, 8, 9)">■</span> levels' in text
+    assert '-90 <span style="color: rgb(4, 5, 6)">■</span>' in text
+    assert 'rgb(7, 8, 9)">■</span> -72.5 dBm levels' in text

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from invertwin.viewer.display import SCENE_GROUPS, Display
-from invertwin.viewer.layers import ROLES
+from invertwin.viewer.display import SCENE_GROUPS, Display, DisplayLayer
+from invertwin.viewer.layers import LEVELS, ROLES
 
 _TICKS = 6  # of the ground along its longer side, about
 _ELEVATION = np.deg2rad(28.0)  # of the first camera above the sight of the radar
@@ -88,11 +88,16 @@ def legend_html(display: Display) -> str:
     Args:
         display: What is shown.
     """
-    roles, keys = {color: role for role, color in ROLES.items()}, dict[str, dict[str, None]]()
+    roles, keys = {color: role for role, color in ROLES.items()}, dict[str, list[DisplayLayer]]()
     for x in display.layers:
         name = roles.get(x.color, "fixed") if x.group in (*SCENE_GROUPS, "boards") else x.group
-        keys.setdefault(name, {})[f'<span style="color: rgb{x.color}">■</span>'] = None
-    rows = [f"<span {_WHOLE}>{''.join(own)} {escape(name)}</span>" for name, own in keys.items()]
+        keys.setdefault(name, []).append(x)
+    rows = list[str]()
+    for name, own in keys.items():
+        marks = "".join({f'<span style="color: rgb{x.color}">■</span>': None for x in own})
+        low, high = own[0].name.split("/")[-1].split(" to ")[0], own[-1].name.split(" to ")[-1]
+        text = f"{escape(low)} {marks} {escape(high)}" if name == LEVELS else marks
+        rows.append(f"<span {_WHOLE}>{text} {escape(name)}</span>")
     # On phones viser has letters of 10 pixels.
     style = "#webgl-software-rendering { display: none } html { font-size: 14.8px !important }"
     return f'<style>{style}</style><div style="padding: 0.3em 1em">{" ".join(rows)}</div>'
