@@ -159,5 +159,5 @@ def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
     layers = [DisplayLayer(name, "surface", none, color=color) for name, color in names.items()]
     text = legend_html(Display("title", layers))
     assert "paths: &lt;b&gt;" in text
-    assert '-90 <span style="color: rgb(4, 5, 6)">■</span>' in text
-    assert 'rgb(7, 8, 9)">■</span> -72.5 dBm levels' in text
+    assert '>-80 <span style="letter-spacing: -0.15em"><span style="color: rgb(4, 5, 6)">' in text
+    assert 'rgb(7, 8, 9)">■</span></span>&ensp;-80 dBm<' in text

@@ -95,9 +95,13 @@ def legend_html(display: Display) -> str:
     rows = list[str]()
     for name, own in keys.items():
         marks = "".join({f'<span style="color: rgb{x.color}">■</span>': None for x in own})
-        low, high = own[0].name.split("/")[-1].split(" to ")[0], own[-1].name.split(" to ")[-1]
-        text = f"{escape(low)} {marks} {escape(high)}" if name == LEVELS else marks
-        rows.append(f"<span {_WHOLE}>{text} {escape(name)}</span>")
+        row = f"{marks} {escape(name)}"
+        if name == LEVELS:  # limits of the bands between: the lowest has no power in some cells
+            low, unit = own[0].name.split(" to ")[-1].split()
+            high = own[-1].name.split("/")[-1].split(" to ")[0]
+            strip = f'<span style="letter-spacing: -0.15em">{marks}</span>&ensp;'
+            row = f"{float(low):.3g} {strip}{float(high):.3g} {escape(unit)}"
+        rows.append(f"<span {_WHOLE}>{row}</span>")
     # On phones viser has letters of 10 pixels.
     style = "#webgl-software-rendering { display: none } html { font-size: 14.8px !important }"
     return f'<style>{style}</style><div style="padding: 0.3em 1em">{" ".join(rows)}</div>'
