@@ -1,5 +1,7 @@
 """Antennas, paths and levels of links as layers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -38,6 +40,17 @@ def test_paths_begin_and_end_at_antennas_and_meet_the_floor_in_the_middle():
     direct = found["paths: line of sight"].points
     assert direct == pytest.approx(np.array([[0.0, 0, 1], [4, 0, 1]]))
     bent = found["paths: reflection"].points
+    assert bent == pytest.approx(np.array([[0.0, 0, 1], [2, 0, 0], [2, 0, 0], [4, 0, 1]]), abs=1e-6)
+
+
+def test_only_the_strongest_paths_of_a_kind_are_drawn():
+    """From the far ceiling comes a hundredth of the power from the floor: it is left out."""
+    receivers = ReceiverPoints(torch.tensor([[4.0, 0.0, 1.0]], dtype=torch.float64))
+    low = floor(PerfectConductor())["floor"]
+    high = low.transform.clone()
+    high[2, 3] = 25.0
+    both = Scene({"floor": low, "ceiling": replace(low, transform=high)})
+    bent = layers_of(both, RadioMap(receivers, SETTINGS))["paths: reflection"].points
     assert bent == pytest.approx(np.array([[0.0, 0, 1], [2, 0, 0], [2, 0, 0], [4, 0, 1]]), abs=1e-6)
 
 

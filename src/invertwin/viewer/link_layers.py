@@ -19,6 +19,7 @@ from invertwin.viewer.layers import LEVELS, ROLES, join_points, to_float32
 from invertwin.viewer.panels import POWER_COLORMAP
 
 _MAX_RECEIVERS, _MAX_ANTENNAS = 4, 64  # whose paths, and which themselves are drawn
+_LEAST_SHARE = 0.1  # of the power of the strongest path of a link and kind, of drawn paths
 _BANDS = 12  # of levels over a plane, of phases on a metasurface
 PHASES = "metasurface: phase −180° to 180°"
 """Group of the cells of metasurfaces by their phase."""
@@ -61,12 +62,17 @@ def _draw_antennas(name: str, places: Tensor) -> DisplayLayer:
 def _draw_paths(
     scene: Scene, sensor: Transmitters, receivers: Tensor, settings: PropagationSettings
 ) -> list[DisplayLayer]:
-    """Paths to some receivers, by the last of the ``KINDS`` that they meet."""
+    """Strongest paths to some receivers, by the last of the ``KINDS`` that they meet."""
     chosen = np.linspace(0, len(receivers) - 1, min(len(receivers), _MAX_RECEIVERS)).astype(int)
     places, ends = sensor.positions.detach(), receivers.detach()[chosen]
     few = replace(settings, edges=min(settings.edges, 1))
     with torch.no_grad():
         paths = few.trace_links(scene, sensor, ends, 0)
+    kind = paths.kinds.amax(1) if paths.kinds.shape[1] else torch.zeros_like(paths.tx)
+    power, group = paths.coefficient.abs().square().sum((1, 2)), len(KINDS) * paths.link + kind
+    none = power.new_zeros(len(KINDS) * len(places) * len(ends))
+    strongest = none.scatter_reduce(0, group, power, "amax")[group]
+    paths = paths.select(power > _LEAST_SHARE * strongest)
     found: dict[int, list[Any]] = {}
     for tx, rx, met, at in zip(paths.tx, paths.rx, paths.kinds, paths.vertices, strict=True):
         points = torch.cat([places[tx][None], at[met > 0], ends[rx][None]])
