@@ -1,7 +1,5 @@
 """Antennas, paths and levels of links as layers."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -49,7 +47,7 @@ def test_only_the_strongest_paths_of_a_kind_are_drawn():
     low = floor(PerfectConductor())["floor"]
     high = low.transform.clone()
     high[2, 3] = 25.0
-    both = Scene({"floor": low, "ceiling": replace(low, transform=high)})
+    both = Scene({"floor": low, "ceiling": Object(low.mesh, low.material, high)})
     bent = layers_of(both, RadioMap(receivers, SETTINGS))["paths: reflection"].points
     assert bent == pytest.approx(np.array([[0.0, 0, 1], [2, 0, 0], [2, 0, 0], [4, 0, 1]]), abs=1e-6)
 
