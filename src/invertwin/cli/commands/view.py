@@ -94,7 +94,7 @@ def _display_of_run(
         display = replace(
             display, steps=[] if is_fit else _steps_in_time(run, own), shows_start=True
         )
-        antennas = [] if is_fit and run.placement else _build_link_layers(run, own, folder)
+        antennas = [] if is_fit else _build_link_layers(run, own, folder)
     if folder is not None and is_fit:
         display = viewer.Display.load(folder / VIEW_FILE)
         for link in links.values():

@@ -127,8 +127,7 @@ def make_fit_display(
         if isinstance(own.model, CoverageMap):
             layers += placement_layers(own.model.coverage, sensor)
         if isinstance(own.model, RadioMap):
-            # Paths would hide the room.
-            layers += [x for x in viewer.link_layers(twin, sensor, own.model) if x.kind == "points"]
+            layers += viewer.link_layers(twin, sensor, own.model)
     spectra = {viewer.MEASURED: fits.maps["measured"], viewer.SIMULATED: fits.maps["twin"]}
     seen = make_sensor_maps(fits.problem, spectra)
     return replace(display, layers=layers, steps=steps if names else (), maps=seen)
