@@ -270,3 +270,36 @@ def test_a_wall_is_proposed_at_the_bright_part_of_a_wide_group():
         and math.hypot(*one.position) < 0.06
         for one in walls
     )
+
+
+class Births(ShapeSearch):
+    """A search that proposes given shapes, one a round, and changes no kinds and no heights."""
+
+    def propose_births(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+        """The next that there is not yet."""
+        return [one for one in (BOX, BALL) if one not in shapes][:1] if len(shapes) < 2 else []
+
+    def _keep(self, shapes: Sequence[ShapeParameters]) -> list[ShapeParameters]:
+        return list(shapes)
+
+    select_kinds = select_headings = split_shapes = select_heights = _keep
+
+
+BALL = ShapeParameters("sphere", (0.9, 0.6), 0.0, 0.3, 0.3, 0.6)
+
+
+@pytest.mark.parametrize(("together", "count"), [(5.0, 1), (15.0, 2)])
+def test_a_newcomer_that_costs_evidence_is_refused(together: float, count: int):
+    """A fit of both moves the box towards the echo of the ball, where each alone is worse."""
+
+    class Moved(Judged):
+        def refine(self, shapes: Sequence[ShapeParameters], steps: int) -> list[ShapeParameters]:
+            """Both, the box moved."""
+            return [replace(BOX, position=(0.0, 0.3)), BALL] if len(shapes) == 2 else list(shapes)
+
+    def judge(shapes: Sequence[ShapeParameters]) -> float:
+        return together if len(shapes) == 2 else 10.0 * (list(shapes) == [BOX])
+
+    search = Births(Moved(judge), None, object.__new__(ImageGrid))
+    assert len(search.run()) == count
+    assert (search.run() == [BOX]) == (count == 1)

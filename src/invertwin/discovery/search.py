@@ -123,11 +123,12 @@ class ShapeSearch:
         """Run the search and return the shapes."""
         shapes = list[ShapeParameters]()
         for _ in range(_BIRTH_ROUNDS):
-            born, before = self.propose_births(shapes), len(shapes)
-            if not born:
+            if not (born := self.propose_births(shapes)):
                 break
-            shapes = self.prune(self.merge_shapes(self.refine([*shapes, *born])))
-            if len(shapes) <= before:
+            found, before = self.prune(self.merge_shapes(self.refine([*shapes, *born]))), shapes
+            # A fit moves what is there towards the newcomer, and may lose more than it gains.
+            shapes = found if self.is_better(found, before) else before
+            if len(shapes) <= len(before):
                 break
         if not shapes:
             return []
