@@ -14,6 +14,7 @@ from invertwin.radar import FMCW, Radar
 from invertwin.scene import Object, RoughDielectric, Scene, box, planar_array, plate, rigid
 from invertwin.viewer import (
     Display,
+    DisplayLayer,
     DisplayMaps,
     DisplayMesh,
     DisplayStep,
@@ -235,3 +236,13 @@ def test_headers_of_other_values_are_refused(tmp_path, path, value):
 def test_points_that_are_not_finite_are_refused(tmp_path):
     with pytest.raises(InputError, match="triangles without corners"):
         Display.load(spoil_array(tmp_path, lambda a: a * np.float32(np.nan), (2, "f")))
+
+
+def test_the_first_camera_stands_behind_a_transmitter():
+    mast = DisplayLayer("transmitters", "points", np.array([[4.0, 1.0, 2.0]], np.float32))
+    places = np.array([[0, 0, 0], [2, 2, 2]], np.float32)
+    floor = DisplayLayer("twin/floor", "surface", places, np.zeros((1, 3), np.int32))
+    assert Display("room", [floor, mast]).sight == pytest.approx((-1.0, 0.0, 0.0))
+    assert Display("radar", [floor], ahead=(0.0, 1.0, 0.0)).sight == (0.0, 1.0, 0.0)
+    above = DisplayLayer("transmitters", "points", np.array([[1.0, 1.0, 9.0]], np.float32))
+    assert Display("room", [floor, above]).sight == (1.0, 0.0, 0.0)

@@ -162,6 +162,14 @@ class Display:
         return every.min(0), every.max(0)
 
     @property
+    def sight(self) -> tuple[float, float, float]:
+        """Level direction of the first camera: that of the radar, or from a transmitter on."""
+        masts = [x.points[0] for x in self.layers if x.name == "transmitters" and len(x.points)]
+        away = (np.mean(self.box, 0) - np.reshape(masts[:1], (-1, 3))) * (1 - np.abs(self.up))
+        length = float(np.linalg.norm(away))
+        return (*(away[0] / length).tolist(),) if length > 0 else self.ahead
+
+    @property
     def groups(self) -> dict[str, bool]:
         """Groups of layers in order, and whether they are seen at first."""
         found: dict[str, bool] = {}

@@ -169,7 +169,7 @@ def view_html(display: Display, sensors: Mapping[str, InteractiveSensor] | None 
     maps = collect_sensor_maps(replace(display, steps=kept), sensors or {})
     data = {
         "up": display.up,
-        "ahead": display.ahead,
+        "ahead": display.sight,
         "box": [corner.tolist() for corner in display.box],
         "layers": [
             # An ellipsoid is inside of its object, and seen through it.

@@ -53,7 +53,7 @@ def draw_ground(scene: Any, display: Display) -> None:
 
 def _first_sight(display: Display) -> NDArray[np.float64]:
     """Direction in which the first camera looks."""
-    up, ahead = np.array(display.up), np.array(display.ahead)
+    up, ahead = np.array(display.up), np.array(display.sight)
     level = np.cos(_ASIDE) * ahead - np.sin(_ASIDE) * np.cross(up, ahead)
     return np.cos(_ELEVATION) * level - np.sin(_ELEVATION) * up
 

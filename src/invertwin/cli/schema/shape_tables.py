@@ -16,7 +16,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.links.metasurface.wall_path import PanelPlacement
-from invertwin.radar import Radar, RadarPose, RadarTrajectory
+from invertwin.radar import RadarPose, RadarTrajectory
 from invertwin.registry.kinds import ConstructorTable, KindGroup, OneOf, Registry
 from invertwin.registry.section import Counts, InputPath, Vector, prefix_errors
 from invertwin.scene.files import load_mesh
