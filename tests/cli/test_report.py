@@ -43,7 +43,7 @@ def test_report_is_self_contained_and_escaped():
     assert '<p class="status">converged</p>' in text
     assert "<tr><td>&lt;letter&gt;</td><td>0.1235</td><td>yes</td></tr>" in text
     assert "<tr><td>wall</td><td>–</td><td>no</td></tr>" in text
-    assert "<p>one &amp; two</p>" in text
+    assert '<p class="lines">one &amp; two</p>' in text
     assert "<summary>run.toml</summary>\n<pre>task = &#34;demo&#34;</pre>" in text
     assert "{{" not in text
     assert "{%" not in text

@@ -45,11 +45,7 @@ class DiscreteSampler:
 
 
 def balance_by_object(
-    rays: RayScene,
-    edge: mit.UInt32,
-    weight: mit.Float,
-    receiver: Mask,
-    antenna_count: int,
+    rays: RayScene, edge: mit.UInt32, weight: mit.Float, receiver: Mask, antenna_count: int
 ) -> mit.Float:
     """Balance the weights of edges between objects.
 

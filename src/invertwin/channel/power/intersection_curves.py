@@ -78,12 +78,7 @@ class IntersectionCurveSampler:
     """
 
     def __init__(
-        self,
-        inputs: Inputs,
-        curves: IntersectionCurves,
-        samples: int,
-        depth: int,
-        seed: int,
+        self, inputs: Inputs, curves: IntersectionCurves, samples: int, depth: int, seed: int
     ) -> None:
         self.rays = rays = inputs.rays
         self.inputs, self.size, self.depth = inputs, samples, depth

@@ -355,9 +355,7 @@ class _PendingVertex:
 
 
 def pull(
-    inputs: Inputs,
-    records: PathRecords,
-    gather: Callable[[PathContribution, mit.Bool], FourFloats],
+    inputs: Inputs, records: PathRecords, gather: Callable[[PathContribution, mit.Bool], FourFloats]
 ) -> None:
     """Reverse mode (vector–Jacobian product): add to the gradients of the attached inputs.
 
