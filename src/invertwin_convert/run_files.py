@@ -431,9 +431,7 @@ class _Conversion:
             return _SMPL
         if shape in _WITHOUT_FRONT:
             return _TURN if self._has_numbered_parts(table, name) else outer
-        if "parts" in table:
-            return outer
-        return _TURN if shape in _BUILT_IN else _KEEP
+        return outer if "parts" in table else _TURN if shape in _BUILT_IN else _KEEP
 
     def _has_numbered_parts(self, table: Any, name: str | None) -> bool:
         """Test if vertices or triangles of a shape are named by number, or seen on it."""
@@ -600,9 +598,7 @@ class _Conversion:
             return f"{key[: key.rindex('[')]}[{axis}]", None
         inner = {p: c for p, c in trial.changes.items() if p[: len(steps)] == steps}
         inner |= {p: None for p in trial.added if p[: len(steps)] == steps}
-        if not inner:
-            return key, None
-        return key, _Inside(self, key)
+        return key, _Inside(self, key) if inner else None
 
 
 @dataclass(frozen=True)

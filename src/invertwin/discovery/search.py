@@ -216,8 +216,7 @@ class ShapeSearch:
             if self.evidence([*known, new]) <= self.evidence(known):
                 break
             found.append(new)
-            near = (grid.positions - grid.positions[index]).norm(dim=1) < _MAX_MERGE_GAP
-            score[:, near] = 0.0
+            score[:, (grid.positions - grid.positions[index]).norm(dim=1) < _MAX_MERGE_GAP] = 0.0
         return found
 
     def unite_groups(

@@ -262,8 +262,7 @@ def _crop_ranges(panels: list[tuple[Any, str, MapPanel]], dynamic_range: float) 
     for cell, *_ in panels:
         cell.set_ylim(bin_edges(shown))
         if cell.get_subplotspec().is_first_col():
-            whole = len(shown) == len(ranges)
-            cell.set_ylabel("range [m]" if whole else label, fontsize=8)
+            cell.set_ylabel("range [m]" if len(shown) == len(ranges) else label, fontsize=8)
 
 
 def _draw_image(cell: Any, title: str, panel: MapPanel, values: NDArray, **style: Any) -> Any:

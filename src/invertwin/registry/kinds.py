@@ -343,8 +343,7 @@ class Registry:
             default = round(math.degrees(default), 9)
         if isinstance(default, tuple) or _allowed_letters(hint):
             default = [*default]  # type: ignore[misc]
-        checked = isinstance(default, str)
-        return kind, Field(default, description=words, validate_default=checked)
+        return kind, Field(default, description=words, validate_default=isinstance(default, str))
 
     def run_file_type(self, hint: Any, name: str) -> Any:
         """Return the type of an argument in run files.

@@ -100,8 +100,7 @@ def _draw_cells(panel: Metasurface, sensor: Transmitters) -> list[DisplayLayer]:
     offsets = panel.cells.offsets[:, None] + _CELL_SHARE * panel.spacing * _CORNERS
     corners = panel.position + scale * offsets @ panel.axes[:, 1:].T
     phases = np.rad2deg(panel.response.detach().angle().numpy())
-    edges = np.linspace(-180, 180, _BANDS + 1)
-    return _draw_bands(PHASES, to_float32(corners), phases, edges, "°")
+    return _draw_bands(PHASES, to_float32(corners), phases, np.linspace(-180, 180, _BANDS + 1), "°")
 
 
 def _draw_bands(

@@ -81,10 +81,8 @@ def _load_json(path: Path) -> dict[str, Any]:
 
 
 def _sibling_path(path: Path, named: str) -> Path:
-    if Path(named).is_file():
-        return Path(named)
     # The name of a file on Windows or on this machine.
-    return path.parent / PureWindowsPath(named).name
+    return Path(named) if Path(named).is_file() else path.parent / PureWindowsPath(named).name
 
 
 def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:

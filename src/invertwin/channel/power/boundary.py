@@ -118,8 +118,7 @@ class BoundarySamples:
         meet = curves is not None and len(curves.first) > 0
         resting = to_index(rests) if sampling.contacts else None
         share = samples // (len(centres) + inner + meet)
-        count = len(centres) * share
-        antennas = SilhouetteSampler(inputs, centres, count, seed, resting=resting)
+        antennas = SilhouetteSampler(inputs, centres, len(centres) * share, seed, resting=resting)
         found: list[tuple[_Sampler, _PathBuilder]] = [(antennas, _antenna_silhouette_paths)]
         if inner:
             inside = InteriorSilhouetteSampler(inputs, share, seed + 2, resting=resting)

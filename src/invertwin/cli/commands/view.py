@@ -137,8 +137,7 @@ def _build_link_layers(run: RunFile, scene: Scene, folder: Path | None) -> list[
     """Antennas, paths, levels and metasurface of a run file of links; else none."""
     if run.placement is not None:
         table, coverage = run.placement, run.placement.coverage(scene, run.seed)
-        panel = table.place(coverage, table.initial)(table.metasurface())
-        return placement_layers(coverage, panel)
+        return placement_layers(coverage, table.place(coverage, table.initial)(table.metasurface()))
     if run.map is None or run.transmitter is None:
         return []
     file, levels = None if folder is None else folder / "map.csv", None
