@@ -1,6 +1,6 @@
 """Calibration of a room from a fifth of its links, against a finer world with hidden furniture.
 
-    python benchmarks/measured_rooms.py [-o DIR] [--rooms 4]
+    python benchmarks/measured_rooms.py [-o DIR] [--rooms 8]
 
 The *world* stands for a measurement: three rooms in a row with doors and walls of unknown
 materials, twelve pieces of furniture of wood and metal, four transmitters below the ceiling, forty
@@ -13,7 +13,7 @@ within 25 dB of its peak, as channel sounders state them.
 
 The *twin* knows the walls alone, starts with the middle of the range of each material, and traces
 paths that meet up to four surfaces, passed walls included. A fifth of the receivers gives it the
-materials, the sent power, and gain and decay of a reverberant tail
+materials, with the ranges as priors, the sent power, and gain and decay of a reverberant tail
 (`invertwin.links.ReverberationParameters`). Prints a table and writes
 `metrics.json` into DIR (default `out/measured_rooms`). All errors are of the other links:
 
@@ -30,6 +30,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ DOOR, FURNITURE = 1.0, 12
 SENDERS, RECEIVERS, EACH = 4, 40, 5  # each fifth receiver calibrates
 DYNAMIC_RANGE_DB, FLOOR = 25.0, 1e-11
 HOW = PropagationSettings(FREQUENCY, BANDWIDTH, depth=4, rays=20_000)
-STEPS = 25
+STEPS, RESIDUAL = 25, 0.1  # the last: both losses of a calibrated room, about
 SCATTERERS, GRAPH_GAIN, IS_EDGE = 80, 0.7, 0.8  # the last: probability of an edge
 REQUIRED: Required = {"level_ratio": ("<=", 0.7), "spread_factor": ("<=", 1.3)}
 COUNTED = {
@@ -225,7 +226,6 @@ def calibrate(world: World, scene: Scene) -> tuple[Scene, Transmitters]:
         scene,
         [
             iw.Observation(gains, world.levels[:, chosen], loss=power, **both),
-            # Both losses begin at about 0.1: one of them does not decide alone.
             iw.Observation(delays, world.spreads[:, chosen], loss=log_error, **both),
         ],
         {
@@ -234,8 +234,24 @@ def calibrate(world: World, scene: Scene) -> tuple[Scene, Transmitters]:
         },
         optimizer=Optimizer("adam", rate=0.1, final_rate=0.02),
         schedule=iw.Schedule(STEPS),
+        regularizers=[partial(log_prior, scene, int(chosen.sum()) * len(world.tx))],
     )
     return found.scene, found.sensors[0]
+
+
+def log_prior(begun: Scene, links: int, scene: Scene) -> Tensor:
+    """Minus the logarithm of the prior probability of materials, in units of the loss.
+
+    Logarithms are as uncertain as in the ranges of `MATERIALS`. The loss is the mean over links of
+    squares, whose variance is `RESIDUAL`.
+    """
+    total = torch.zeros(()).double()
+    for name, *ranges in zip(scene.objects, *MATERIALS, strict=True):
+        now, then = scene[name].material, begun[name].material
+        for key, (low, high) in zip(("permittivity", "conductivity"), ranges, strict=True):
+            moved = (getattr(now, key) / getattr(then, key)).log()
+            total = total + (moved / math.log(high / low)).square() * 12
+    return RESIDUAL / links * total
 
 
 def log_error(predicted: Tensor, observed: Tensor) -> Tensor:
@@ -299,7 +315,7 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("out/measured_rooms"))
-    parser.add_argument("--rooms", type=int, default=4)
+    parser.add_argument("--rooms", type=int, default=8)
     given = parser.parse_args()
     metrics = measure(given.rooms)
     table = MetricTable("Calibrated rooms", REQUIRED)
