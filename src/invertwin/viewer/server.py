@@ -316,8 +316,9 @@ class Viewer:
         self._nodes[layer.name] = made
 
     def _top(self, layer: DisplayLayer) -> NDArray[np.float32]:
-        """The highest point of a surface."""
-        return layer.points[(layer.points @ np.array(self._display.up)).argmax()]
+        """The highest point of a surface; of several the farthest, which is before no object."""
+        toward = np.array(self._display.up) + 1e-3 * np.array(self._display.sight)
+        return layer.points[(layer.points @ toward).argmax()]
 
     def _run_worker(self) -> None:
         """Trace what the person wants, the latest alone; single paths when nothing moves."""
