@@ -114,8 +114,7 @@ def _simulate_moving_frames(
             described_arrays.write_chirps(folder.file("chirps.toml"), data, "chirps.npy", arrays)
     metrics = {"wall_seconds": seconds, **describe_frame(maps, radar, chirps)}
     first = {"first frame": maps.total_power[None]}
-    figure = plotting.range_doppler(maps)
-    view = save_picture(folder, "doppler", figure, "First frame", "doppler")
+    view = save_picture(folder, "doppler", plotting.range_doppler(maps), "First frame", "doppler")
     return beat, metrics, [view, *draw_spectrogram(maps, folder)], first
 
 
