@@ -87,8 +87,7 @@ def make_stages(
     kept = set(names)
     for number, stage in enumerate(stages):
         for name in stage.unknowns:
-            what = f"names of parameters in stage {number + 1}:"
-            check_choice(name, names, what, "correct it")
+            check_choice(name, names, f"names of parameters in stage {number + 1}:", "correct it")
         if number and stage.rebuilds_modules:
             kept = set(stage.unknowns or names)
         gone = [name for name in stage.unknowns if name not in kept]

@@ -144,8 +144,7 @@ class Cells(ReceiverLocations):
         places = sensor.positions, self.surface(), points.flatten(0, 1), propagation.frequency
         edges = self.sampling.edge_points if self.sampling.boundary else 0
         how: Any = {"depth": propagation.depth, "rays": propagation.rays, "seed": seed}
-        counted = PathMeasure(measure, 3)
-        lit = trace_coverage(scene, *places, counted, boundary_samples=edges, **how)
+        lit = trace_coverage(scene, *places, PathMeasure(measure, 3), boundary_samples=edges, **how)
         mean = lit.amount.unflatten(1, points.shape[:2]).mean(2)
         for part in lit.boundary_paths:
             cell = self.find_cells(part.point, part.face)

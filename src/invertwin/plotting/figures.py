@@ -75,8 +75,7 @@ def signed_colors(values: Iterable[Tensor], share: float) -> dict[str, Any]:
         values: The maps.
         share: Of the values of each that the colours reach; the largest stick out.
     """
-    reached = (float(np.quantile(np.abs(numbers(v)), share)) for v in values)
-    limit = max(reached, default=1.0) or 1.0
+    limit = max((float(np.quantile(np.abs(numbers(v)), share)) for v in values), default=1.0) or 1.0
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
 
 

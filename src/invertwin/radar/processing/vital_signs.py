@@ -159,8 +159,7 @@ def _find_oscillation(
     )
     inside = (frequencies >= band[0]) & (frequencies <= band[1])
     frequency = frequencies[inside][power[inside].argmax()]
-    times = interval * np.arange(count)
-    own, (amplitude,) = _fit_sines(values, times, np.array([frequency]))
+    own, (amplitude,) = _fit_sines(values, interval * np.arange(count), np.array([frequency]))
     order = signal.butter(2, band, "bandpass", fs=1 / interval, output="sos")
     noise = signal.sosfiltfilt(order, values - own)
     # White noise of this power in the band.
