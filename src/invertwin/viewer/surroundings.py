@@ -58,7 +58,7 @@ def _first_sight(display: Display) -> NDArray[np.float64]:
     return np.cos(_ELEVATION) * level - np.sin(_ELEVATION) * up
 
 
-def set_camera(camera: Any, display: Display, aspect: float = 1.0) -> None:
+def set_camera(camera: Any, display: Display, aspect: float = 1.6) -> None:
     """Put the first camera behind and above the radar, so that it sees the radar and the scene.
 
     Args:
