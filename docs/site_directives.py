@@ -116,14 +116,14 @@ def fold(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: o
         if entry.find_parent("dl", class_="py") is None and page.startswith("api/"):
             first = entry.select_one("dd > p")
             said = "" if first is None else first.get_text().split(". ")[0].rstrip(".")
-            name = str(entry.dt["id"]).rsplit(".", 1)[-1]
+            name = str(entry.select("dt")[0]["id"]).rsplit(".", 1)[-1]
             text = BeautifulSoup(f"<code>{name}</code> {html.escape(said)}", "html.parser")
             after = entry.find_next_sibling()
             used = after is not None and after.get_text().startswith("Used in:")
             _fold(body, text, [entry, after] if used else [entry])
     if len(body.get_text()) > LONG and not page.startswith("api/"):
         for heading in body.find_all("h3") or body.find_all("h2"):
-            section = heading.parent
+            section, *_ = heading.parents
             rest = [part for part in section.contents if part is not heading]
             inner = _fold(body, heading, rest)
             inner["id"] = section.attrs.pop("id")  # so that links open it
