@@ -103,3 +103,16 @@ def test_it_is_an_object_of_a_scene():
     assert set(one.values()) == {"thing.place", "thing.height", "thing.brightness"}
     assert math.isclose(float(one.values()["thing.height"]), 1.1)
     assert isinstance(one.shape, PrismParameters)
+
+
+@pytest.mark.parametrize("length", [0.5, 0.62, 0.8, 1.03])
+def test_a_wall_thinner_than_the_spacing_of_nodes_has_an_outline(length: float):
+    """It lies on a line of nodes, or between two."""
+    wall = ShapeParameters("box", (2.0, 0.3), 0.0, length, 0.02, 1.0)
+    start = merge_into_prism([wall], 0.0, 0.04)
+    model = OutlineModel("wall", start)
+    places = model.mesh().vertices.detach()
+    low, high = places[:, :2].amin(0), places[:, :2].amax(0)
+    assert 0.5 * (low + high) == pytest.approx(torch.tensor([2.0, 0.3]).double(), abs=0.02)
+    assert float(high[1] - low[1]) < 3 * 0.04
+    assert float(high[0] - low[0]) == pytest.approx(length, abs=0.08)

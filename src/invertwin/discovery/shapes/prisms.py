@@ -61,7 +61,9 @@ def merge_into_prism(shapes: primitives.Shapes, level: float, spacing: float) ->
     largest = max(shapes, key=lambda one: one.length * one.width)
     x, y = middle.tolist()
     shape: dict[str, Any] = {"height": largest.height, "brightness": largest.brightness}
-    shape |= {"distances": torch.stack(parts).amin(0).reshape(counts), "spacing": step}
+    found = torch.stack(parts).amin(0).reshape(counts)
+    # A wall that is thinner than the spacing may lie between nodes.
+    shape |= {"distances": found - (found.amin() + 0.5 * step).clamp_min(0.0), "spacing": step}
     return PrismParameters("prism", (x, y), middle=(x, y), **shape)
 
 
