@@ -161,3 +161,12 @@ def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
     assert "paths: &lt;b&gt;" in text
     assert '>-80 <span style="letter-spacing: -0.15em"><span style="color: rgb(4, 5, 6)">' in text
     assert 'rgb(7, 8, 9)">■</span></span>&ensp;-80 dBm<' in text
+
+
+@pytest.mark.parametrize("names", [["levels/low"], ["levels"], ["levels/<a>", "levels/<b>"]])
+def test_a_file_may_name_its_levels_otherwise(names):
+    none = np.zeros((0, 3), np.float32)
+    text = legend_html(Display("title", [DisplayLayer(name, "surface", none) for name in names]))
+    assert text.count("■") == 1
+    assert "<a>" not in text
+    assert "<b>" not in text
