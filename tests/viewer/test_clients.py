@@ -198,10 +198,22 @@ def test_what_is_no_message_is_none(raw):
     assert not is_valid_message(raw, {})
 
 
+@pytest.mark.parametrize("band", [None, (1e9, 1e9), (1e9, -1e9), (0.0, 0.0)])
+def test_a_file_with_other_levels_opens(band):
+    faces, corners = np.array([[0, 1, 2]], np.int32), np.eye(3, dtype=np.float32)
+    made = [DisplayLayer(f"levels/{k}", "surface", corners, faces, band=band) for k in "ab"]
+    with Viewer(Display("map", made), port=0) as viewer:
+        labels = {x.label for x in viewer._server.gui._gui_input_handle_from_uuid.values()}
+        assert ("lowest level []" in labels) == (band is not None)
+
+
 def test_the_level_slider_hides_the_cells_below_it():
     faces = np.array([[0, 1, 2]], np.int32)
-    names = [f"levels/{low} to {low + 10} dB" for low in (-70, -60, -50)]
-    bands = [DisplayLayer(n, "surface", np.eye(3, dtype=np.float32), faces) for n in names]
+    names, corners = ["levels/low", "levels/middle", "levels/high"], np.eye(3, dtype=np.float32)
+    bands = [
+        DisplayLayer(name, "surface", corners, faces, band=(low, low + 10), unit="dB")
+        for name, low in zip(names, (-70.0, -60.0, -50.0), strict=True)
+    ]
     with Viewer(Display("map", bands), port=0) as made:
         known = {x.label: x for x in made._server.gui._gui_input_handle_from_uuid.values()}
         slider, box = known["lowest level [dB]"], known["levels"]

@@ -69,13 +69,14 @@ def test_cells_are_in_the_band_of_their_level():
     assert sum(len(layer.points) for layer in bands.values()) == 4 * 31
     centres = plane.centres.reshape(-1, 3).numpy()
     for name, layer in bands.items():
-        low, high = (float(word) for word in name.removesuffix(" dBm").split(" to "))
+        assert layer.band is not None
+        assert name == f"{layer.band[0]:.4g} to {layer.band[1]:.4g} {layer.unit}"
         middles = layer.points.reshape(-1, 4, 3).mean(1)
         away = np.linalg.norm(middles[:, None] - centres[None], axis=2)
         assert away.min(1).max() < 1e-6
         own = levels.ravel()[away.argmin(1)]
-        assert own.min() >= low - 0.06
-        assert own.max() <= high + 0.06
+        assert layer.band[0] <= own.min()
+        assert own.max() <= layer.band[1]
         first, second, third = layer.points[layer.faces].transpose(1, 0, 2)
         areas = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2
         assert areas == pytest.approx(0.125)

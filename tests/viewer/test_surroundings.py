@@ -154,9 +154,14 @@ def test_the_legend_names_the_roles_that_there_are():
 
 def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
     none = np.zeros((0, 3), np.float32)
-    bands = {"levels/-90 to -80 dBm": (4, 5, 6), "levels/-80 to -72.5 dBm": (7, 8, 9)}
-    names = {"paths: <b>": (1, 2, 3), **bands}
-    layers = [DisplayLayer(name, "surface", none, color=color) for name, color in names.items()]
+    dark, light, levels = (4, 5, 6), (7, 8, 9), {"band": (-90.0, -80.0), "unit": "dBm"}
+    layers = [
+        DisplayLayer("paths: <b>", "surface", none, color=(1, 2, 3)),
+        DisplayLayer("levels/low", "surface", none, color=dark, **levels),
+        DisplayLayer(
+            "levels/high", "surface", none, color=light, **levels | {"band": (-80, -72.5)}
+        ),
+    ]
     text = legend_html(Display("title", layers))
     assert "paths: &lt;b&gt;" in text
     assert '>-80 <span style="letter-spacing: -0.15em"><span style="color: rgb(4, 5, 6)">' in text
@@ -164,7 +169,7 @@ def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
 
 
 @pytest.mark.parametrize("names", [["levels/low"], ["levels"], ["levels/<a>", "levels/<b>"]])
-def test_a_file_may_name_its_levels_otherwise(names):
+def test_levels_without_limits_have_their_name_in_the_legend(names):
     none = np.zeros((0, 3), np.float32)
     text = legend_html(Display("title", [DisplayLayer(name, "surface", none) for name in names]))
     assert text.count("■") == 1

@@ -4,12 +4,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter
+from pydantic import ConfigDict, Field, TypeAdapter
 from torch import Tensor
 
 from invertwin.channel import Grid
@@ -21,6 +21,8 @@ _RERUN_ADVICE = "repeat the run with --overwrite"
 _MAX_VALUES = 2_000_000  # of maps that are kept
 SCENE_GROUPS = ("twin", "truth", "start")
 """Groups of layers that are surfaces of a scene."""
+
+_Level = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,8 @@ class DisplayLayer:
         color: Red, green and blue, 0 to 255.
         opacity: 1 hides what is behind.
         shown: Whether it is seen at first.
+        band: Of cells of a map, their lowest and highest value.
+        unit: Of these values.
     """
 
     name: str
@@ -57,6 +61,8 @@ class DisplayLayer:
     color: tuple[int, int, int] = (185, 190, 199)
     opacity: float = 1.0
     shown: bool = True
+    band: tuple[_Level, _Level] | None = None
+    unit: str = ""
 
     @property
     def group(self) -> str:

@@ -191,12 +191,12 @@ class Viewer:
 
     def _build_level_slider(self) -> None:
         """Let the person hide all cells below a level."""
-        bands = [name for name in self._nodes if name.split("/")[0] == layers.LEVELS]
-        if len(bands) < 2:
+        bands = [x for x in self._display.layers if x.band and x.group == layers.LEVELS]
+        tops = {x.name: x.band[1] for x in bands if x.band and x.name in self._nodes}
+        if len(tops) < 2:
             return
-        tops = {name: float(name.split(" to ")[1].split()[0]) for name in bands}
-        low, high, unit = tops[bands[0]], tops[bands[-1]], bands[0].split()[-1]
-        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-12) / 20))
+        low, high, unit = min(tops.values()), max(tops.values()), bands[0].unit
+        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6 * abs(high), 1e-12) / 20))
         ends = step * (math.floor(low / step) - 1), step * (math.ceil(high / step) - 1)
         slider = self._server.gui.add_slider(f"lowest level [{unit}]", *ends, step, ends[0])
 

@@ -96,11 +96,10 @@ def legend_html(display: Display) -> str:
     for name, own in keys.items():
         marks = "".join({f'<span style="color: rgb{x.color}">■</span>': None for x in own})
         row = f"{marks} {escape(name)}"
-        if name == LEVELS and len(own) > 1:  # the lowest band has no power in some cells
-            low, _, unit = own[0].name.rpartition(" to ")[2].partition(" ")
-            high = own[-1].name.split("/")[-1].partition(" to ")[0]
+        bands = [x.band for x in own if x.band and name == LEVELS]
+        if len(bands) > 1:  # the lowest band has no power in some cells
             strip = f'<span style="letter-spacing: -0.15em">{marks}</span>&ensp;'
-            row = f"{escape(low)} {strip}{escape(f'{high} {unit}')}"
+            row = f"{bands[0][1]:.4g} {strip}{bands[-1][0]:.4g} {escape(own[-1].unit)}"
         rows.append(f"<span {_WHOLE}>{row}</span>")
     # On phones viser has letters of 10 pixels.
     style = "#webgl-software-rendering { display: none } html { font-size: 14.8px !important }"

@@ -100,8 +100,7 @@ def join_legs(
     """
     first = link.tx[outbound.tx] + outbound.length[:, None] * outbound.departure
     last = link.rx[inbound.tx] + inbound.length[:, None] * inbound.departure
-    delay = outbound.delay + inbound.delay
-    return coherent_paths(link, outbound.tx, delay, fields, first, last)
+    return coherent_paths(link, outbound.tx, outbound.delay + inbound.delay, fields, first, last)
 
 
 def fields_at_target(
