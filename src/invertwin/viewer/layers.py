@@ -112,7 +112,8 @@ def radar_layers(
     faces = torch.cat([board.faces + k * len(board.vertices) for k in range(len(boarded))])
     u = torch.tensor([-1.0, 1.0, 1.0, -1.0]).double() * _largest_cosine(grid and grid.u)
     v = torch.tensor([-1.0, -1.0, 1.0, 1.0]).double() * _largest_cosine(grid and grid.v)
-    rays = torch.stack([(1 - u.square() - v.square()).clamp_min(0.0).sqrt(), u, v], dim=1) * length
+    w = (1 - u.square() - v.square()).clamp_min(0.0).sqrt()
+    rays = torch.stack([w, u, v], dim=1) * length
     lines = []
     for k in chosen:
         ends = places[k] + rays @ axes[k].T

@@ -71,7 +71,8 @@ def _draw_paths(
     kind = paths.kinds.amax(1) if paths.kinds.shape[1] else torch.zeros_like(paths.tx)
     power, group = paths.coefficient.abs().square().sum((1, 2)), len(KINDS) * paths.link + kind
     none = power.new_zeros(len(KINDS) * len(places) * len(ends))
-    paths = paths.select(power > _LEAST_SHARE * none.scatter_reduce(0, group, power, "amax")[group])
+    strongest = none.scatter_reduce(0, group, power, "amax")[group]
+    paths = paths.select(power > _LEAST_SHARE * strongest)
     found: dict[int, list[Any]] = {}
     for tx, rx, met, at in zip(paths.tx, paths.rx, paths.kinds, paths.vertices, strict=True):
         points = torch.cat([places[tx][None], at[met > 0], ends[rx][None]])
@@ -116,7 +117,7 @@ def _draw_bands(
         red, green, blue, _ = colormaps[colormap]((band + 0.5) / _BANDS, bytes=True)
         look = (int(red), int(green), int(blue)), opacity
         low, high = float(edges[band]), float(edges[band + 1])
-        name, triangles = f"{group}/{low:.4g} to {high:.4g} {unit}", faces.reshape(-1, 3)
-        body = own.reshape(-1, 3), triangles.astype(np.int32), *look
+        name = f"{group}/{low:.4g} to {high:.4g} {unit}"
+        body = own.reshape(-1, 3), faces.reshape(-1, 3).astype(np.int32), *look
         layers.append(DisplayLayer(name, "surface", *body, band=(low, high), unit=unit))
     return layers

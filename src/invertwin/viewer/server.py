@@ -191,8 +191,9 @@ class Viewer:
 
     def _build_level_slider(self) -> None:
         """Let the person hide all cells below a level."""
-        bands = [x for x in self._display.layers if x.band and x.group == layers.LEVELS]
-        tops = {x.name: x.band[1] for x in bands if x.band and x.name in self._nodes}
+        own = (x for x in self._display.layers if x.name in self._nodes)
+        bands = [x for x in own if x.group == layers.LEVELS]
+        tops = {x.name: x.band[1] for x in bands if x.band}
         if len(tops) < 2:
             return
         low, high, unit = min(tops.values()), max(tops.values()), bands[0].unit

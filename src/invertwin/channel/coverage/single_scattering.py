@@ -282,10 +282,8 @@ class SingleScatteringTracer:
         for end in range(1 if self.pairing == "monostatic" else 2):
             count = -(-self.sampling.boundary_samples // (antennas if end or paired else 1))
             with _DisableFuncTorch():
-                receiver, depth = (
-                    shadow_boundaries.ReceivingTriangles(self.is_scattering),
-                    self.depth - 1,
-                )
+                receiver = shadow_boundaries.ReceivingTriangles(self.is_scattering)
+                depth = self.depth - 1
                 search = receiver, self.antennas[end], self.sequences[end], self.powers
                 samples_by_length = shadow_boundaries.sample_illumination_boundaries(
                     self.surfaces, *search, depth=depth, samples=count, seed=self.seed + 2 + end

@@ -356,10 +356,8 @@ class _FarFieldTracer:
             receiver, surface_rows = self.receivers[patches.aspect], interfaces.rows(patches.facet)
             if solids is None:
                 surface = (surface_rows, k, *wave)
-                radiated, reflected = (
-                    plane_waves.radiate_field(*surface, receiver),
-                    plane_waves.reflect_field(*surface),
-                )
+                radiated = plane_waves.radiate_field(*surface, receiver)
+                reflected = plane_waves.reflect_field(*surface)
             else:
                 powers.append(incident_power(solids, patches, field))
                 radiated, reflected, transmitted = scatter_at_interfaces(

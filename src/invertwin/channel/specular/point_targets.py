@@ -100,7 +100,8 @@ def join_legs(
     """
     first = link.tx[outbound.tx] + outbound.length[:, None] * outbound.departure
     last = link.rx[inbound.tx] + inbound.length[:, None] * inbound.departure
-    return coherent_paths(link, outbound.tx, outbound.delay + inbound.delay, fields, first, last)
+    delay = outbound.delay + inbound.delay
+    return coherent_paths(link, outbound.tx, delay, fields, first, last)
 
 
 def fields_at_target(
