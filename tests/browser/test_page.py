@@ -108,6 +108,13 @@ def image(png: bytes) -> Image.Image:
     return Image.open(io.BytesIO(png))
 
 
+def find_yellow_columns(png: bytes) -> np.ndarray:
+    """Columns of the pixels in the colour of what feeds a bin."""
+    pixels = np.asarray(image(png).convert("RGB"), float)
+    yellow = (pixels[..., 0] > 200) & (pixels[..., 1] > 180) & (pixels[..., 2] < 60)
+    return np.nonzero(yellow)[1]
+
+
 def blank(png: bytes) -> bytes:
     file = io.BytesIO()
     Image.new("RGB", image(png).size, "white").save(file, "png")
@@ -146,15 +153,14 @@ def test_a_click_lights_what_feeds_a_bin_for_every_sensor_and_position(
             assert float(found[1]) == pytest.approx(distance - 0.3, abs=grid.range_step)
             assert float(found[2]) == pytest.approx(u, abs=grid.u_step)
             assert int(found[3]) > 3
-            for _ in range(10):  # slow machines draw later
-                shown = page.locator("#view canvas").first.screenshot()
-                lit = np.asarray(image(shown).convert("RGB"), float)
-                lit = np.nonzero((lit[..., 0] > 200) & (lit[..., 1] > 180) & (lit[..., 2] < 60))
-                if len(lit[0]):
+            view = page.locator("#view canvas").first.screenshot()
+            for _ in range(10):
+                if len(find_yellow_columns(view)):
                     break
-                page.wait_for_timeout(1000)
+                page.wait_for_timeout(1000)  # slow machines draw later
+                view = page.locator("#view canvas").first.screenshot()
             page.screenshot(path=str(pictures / f"fed_{number}_{frame}.png"))
-            assert abs(np.median(lit[1]) - blue(shown)) < 60
+            assert abs(np.median(find_yellow_columns(view)) - blue(view)) < 60
     # A bin in front of everything is fed by nothing.
     box = picture_of(page, "simulated").bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] - 2)
