@@ -97,7 +97,7 @@ def whole(tx, rx, order, *, corners=True):
     """What the edges of a box send."""
     mesh = box((5.0, 3.0, 4.0))
     topology = topology_of([mesh])
-    walls = CandidateSurfaces(mesh.vertices, topology, tx)
+    walls = CandidateSurfaces(mesh.vertices, topology, tx, torch.zeros(len(topology.faces)).bool())
     around = WedgeScene(
         mesh.vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
     )

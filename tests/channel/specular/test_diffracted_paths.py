@@ -25,7 +25,7 @@ def surroundings(*meshes, scale=1.0):
     """Conductors; a wavelength is a metre."""
     vertices = torch.cat([mesh.vertices for mesh in meshes]) * scale
     topology = topology_of(list(meshes))
-    walls = CandidateSurfaces(vertices.detach(), topology, TX[None])
+    walls = CandidateSurfaces(vertices.detach(), topology, TX[None], torch.zeros(len(topology.faces)).bool())
     return WedgeScene(
         vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
     )

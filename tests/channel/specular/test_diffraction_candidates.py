@@ -95,7 +95,7 @@ def step_at(
     start, way = line
 
     def there(share: float) -> int:
-        return len(of_kind(trace(around, rx=start + share * way, edges=0), steps))
+        return len(of_kind(trace(around, rx=start + share * way, depth=depth, edges=0), steps))
 
     low, high = 0.0, 1.0
     first = there(low)
@@ -107,7 +107,7 @@ def step_at(
     shares = float64([-2e-7, -1e-7, 1e-7, 2e-7]) + low
     places = start + shares[:, None] * way
     found, scale = [], 0.0
-    every: tuple[dict[str, Any], ...] = ({"depth": depth}, {"edges": 0})
+    every: tuple[dict[str, Any], ...] = ({"depth": depth}, {"depth": depth, "edges": 0})
     for options in every:
         field = response(trace(around, rx=places, **options))
         scale = scale or float(field[1].norm())
@@ -140,6 +140,16 @@ def test_what_is_mirrored_once_more_ends_at_edges_without_a_jump(depth):
     """From the floor by the wall; with one surface, edges behind the floor mirror nothing."""
     line = float64([0.2, -3.5, 1.8]), float64([0.02, 0.05, 0.9])
     whole, optics = step_at(scene(), line, "RR", depth)
+    assert optics > 0.1
+    assert whole < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("steps", "depth"), [("T", 0), ("TR", 1)])
+def test_what_passes_a_sheet_ends_at_its_rim_without_a_jump(steps, depth):
+    """Without reflections that are left, edges of a sheet still transmit."""
+    line = float64([0.5, 5.3, 1.2]), float64([3.0, 0.05, 0.1])
+    whole, optics = step_at(scene(GLASS), line, steps, depth)
     assert optics > 0.1
     assert whole < 1e-6
 

@@ -331,8 +331,10 @@ def test_a_slab_of_air_is_not_there():
     through = with_air.select((with_air.kinds == 2).any(1))
     assert len(through) > 3
     bare = trace(scene, *ends, depth=3)
+    assert len(bare) == len(with_air)  # a passage uses up nothing of the depth
     for row in range(len(through)):
-        same = (bare.delay - through.delay[row]).abs() < 1e-18
+        same = (bare.departure - through.departure[row]).norm(dim=1) < 1e-9
+        same &= (bare.delay - through.delay[row]).abs() < 1e-18
         assert int(same.sum()) == 1
         torch.testing.assert_close(
             bare.coefficient[same][0], through.coefficient[row], rtol=1e-12, atol=1e-18
@@ -344,7 +346,7 @@ def test_two_boards_multiply_and_a_wall_between_them_mirrors():
         name: thing(level_plate(3.0, 3.0), (0.0, 0.0, z), material=slab())
         for name, z in (("near", 1.0), ("far", 2.0))
     }
-    paths = trace(Scene(boards), [0.0, 0.0, 0.0], [0.0, 0.0, 3.0], depth=4)
+    paths = trace(Scene(boards), [0.0, 0.0, 0.0], [0.0, 0.0, 3.0], depth=2)
     # Straight through both, and with two mirrors between them.
     assert [[k for k in row if k] for row in paths.kinds.tolist()] == [[2, 2], [2, 1, 1, 2]]
     assert paths.length[1] == pytest.approx(5.0)
@@ -352,6 +354,25 @@ def test_two_boards_multiply_and_a_wall_between_them_mirrors():
     share = one.coefficient[0, 1, 1] * 4 * math.pi * 3 / WAVELENGTH
     whole = paths.coefficient[0, 1, 1] * 4 * math.pi * 3 / WAVELENGTH
     torch.testing.assert_close(whole, share**2)
+
+
+@pytest.mark.parametrize("rays", [20_000, None])
+def test_sheets_on_the_way_use_up_no_depth(rays: int | None):
+    """Five boards and a floor: the straight path, and that by way of the floor."""
+    boards = {
+        f"board {k}": thing(level_plate(4.0, 4.0), (float(k), 0.0, 0.0), (0.0, 1.5, 0.0), slab())
+        for k in range(1, 6)
+    }
+    floor = thing(level_plate(40.0, 40.0), (0.0, 0.0, -1.9), material=METAL)
+    scene = Scene(boards | {"floor": floor})
+    ends = [0.0, 0.1, 0.3], [6.0, 0.2, -0.4]
+    straight = trace(scene, *ends, depth=0, rays=rays)
+    assert straight.kinds.tolist() == [[2] * 5]
+    found = trace(scene, *ends, depth=1, rays=rays)
+    on_floor = found.select((found.objects == found.names.index("floor")).any(1))
+    assert [row.count(2) for row in on_floor.kinds.tolist()] == [5]
+    back = trace(scene, ends[1], ends[0], depth=1, rays=rays)
+    assert back.delay.sort().values.tolist() == pytest.approx(found.delay.sort().values.tolist())
 
 
 def test_layers_of_one_material_are_one_slab():

@@ -102,7 +102,7 @@ def trace_coverage(
         points: points on the surface [m].
         frequency: carrier frequency [Hz].
         measure: values that a path contributes.
-        depth: maximum number of surfaces on a path.
+        depth: maximum number of reflections on a path; sheets are passed on the way.
         rays: number of rays from each transmitter to find sequences of surfaces; None tests every
             one.
         boundary_samples: number of points on edges, for each transmitter; 0 leaves boundary paths
@@ -141,7 +141,7 @@ class _CoverageTracer:
         with _DisableFuncTorch():
             places = strip_derivatives(surface.vertices)
             vertices, ends = strip_derivatives(stage.vertices), torch.cat([self.tx, places])
-            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends)
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends, powers.transmit)
             own, origin = topology_of([surface]), self.surfaces.origin
             self.receiving_surface = shadow_boundaries.ReceivingSurface(places, own, origin)
             self.meshes = [*(item.mesh for item in stage.scene.objects.values()), surface]

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import normalize
 
 from invertwin.channel.em import plane_waves as waves
 from invertwin.channel.em.plane_waves import cross, dot, interpolate_vectors, reflect_vectors
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
+from invertwin.channel.rays.ray_scene import MAX_SHEETS, RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.channel.specular.candidates import FaceInteractions
@@ -154,7 +154,7 @@ class _RaysPastEdges(Rows):
         edge_point: number of the edge point.
         side: unit vector from the edge to the ray.
         steps_before_edge: number of steps before the edge.
-        faces, through: steps so far, padded with −1.
+        faces, through: triangles so far, and a mask of those that transmit.
     """
 
     origin: Tensor
@@ -202,7 +202,7 @@ def sample_illumination_boundaries(
         tx: transmitter positions in world axes, detached [m].
         sequences: candidate sequences from transmitter to edge, by length from 1.
         powers: interactions of the triangles.
-        depth: maximum number of steps of a path.
+        depth: maximum number of reflections of a path; it passes up to 8 sheets.
         samples: number of points on edges, for each transmitter.
         seed: random seed of the points.
     """
@@ -219,9 +219,7 @@ def sample_illumination_boundaries(
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
         for part in paths:
             part = replace(part, source=part.source + number)
-            for legs in _launch_past_edges(
-                surfaces, source - surfaces.origin, y, ends, part, depth
-            ):
+            for legs in _launch_past_edges(surfaces, source - surfaces.origin, y, ends, part):
                 for last, face in _follow_rays(surfaces, receiver, legs, powers, depth):
                     hits.setdefault(last.faces.shape[1], []).append((last, face))
         for part in hits.values():
@@ -288,7 +286,6 @@ def _launch_past_edges(
     edge_points: Tensor,
     ends: Sequence[Tensor],
     chains: SpecularPaths,
-    depth: int,
 ) -> Iterator[_RaysPastEdges]:
     """Launch rays past edges, one on each side, from the last surface before them."""
     planes, count = surfaces.planes, chains.faces.shape[1]
@@ -320,9 +317,7 @@ def _launch_past_edges(
             origin = image + start[:, None] * direction + offset_length[:, None] * normal[:, -1]
         rays = origin, direction, length - start, chains.source, chains.target, side
         steps = torch.full_like(chains.source, count)
-        faces = pad(chains.faces, (0, depth - count), value=-1)
-        through = pad(chains.transmitted, (0, depth - count), value=False)
-        yield _RaysPastEdges(*rays, steps, faces, through).select(valid)
+        yield _RaysPastEdges(*rays, steps, chains.faces, chains.transmitted).select(valid)
 
 
 def _follow_rays(
@@ -333,32 +328,28 @@ def _follow_rays(
     depth: int,
 ) -> Iterator[tuple[_RaysPastEdges, Tensor]]:
     """Follow rays through the scene to the surface: last legs with the triangle that they hit."""
-    step = int(rays.steps_before_edge[0]) if len(rays.edge_point) else depth
     while len(rays.edge_point):
         face, distance = surfaces.find_first_hits(rays.origin, rays.direction)
         for rows, triangle in receiver.find_received(rays, face, distance):
-            part = rays.select(rows)
-            steps = {"faces": part.faces[:, :step], "through": part.through[:, :step]}
-            yield replace(part, **steps), triangle
-        if step == depth:
-            return
+            yield rays.select(rows), triangle
         has_plane = (face >= 0) & (surfaces.planes.face_plane[face.clamp_min(0)] >= 0)
+        passed = rays.through.sum(1)
+        is_left = rays.faces.shape[1] - passed < depth, passed < MAX_SHEETS
         branches: list[_RaysPastEdges] = []
         for passes, mask in ((False, powers.reflect), (True, powers.transmit)):
-            rows = torch.nonzero(has_plane & mask[face.clamp_min(0)])[:, 0]
+            rows = torch.nonzero(has_plane & mask[face.clamp_min(0)] & is_left[passes])[:, 0]
             part, hit = rays.select(rows), face[rows]
             normal = surfaces.planes.normal[surfaces.planes.face_plane[hit]]
             hit_point = part.origin + distance[rows, None] * part.direction
             next_direction = part.direction if passes else reflect_vectors(part.direction, normal)
             ray_offset = surfaces.margin * dot(next_direction, normal).sign()
-            faces, through = part.faces.clone(), part.through.clone()
-            faces[:, step], through[:, step] = hit, passes
+            faces = torch.cat([part.faces, hit[:, None]], 1)
+            through = torch.cat([part.through, torch.full_like(hit[:, None], passes).bool()], 1)
             origin = hit_point + ray_offset[:, None] * normal
             left = part.min_distance - distance[rows]
             part = replace(part, origin=origin, direction=next_direction, min_distance=left)
             branches.append(replace(part, faces=faces, through=through))
         rays = concatenate_rows(branches)
-        step += 1
 
 
 def evaluate_illumination_boundary(

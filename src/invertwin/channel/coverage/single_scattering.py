@@ -123,7 +123,7 @@ def trace_single_scattering(
         rays: number of rays from all transmitters together, and from all receivers, to find
             sequences of surfaces; None tests every one.
         sampling: numbers of points and of edge points, boundary paths and contacts; ``depth`` is
-            the maximum number of surfaces on a path, the rough one included.
+            the maximum number of reflections on a path, the rough one included.
         seed: random seed of all samples.
 
     Raises:
@@ -210,7 +210,8 @@ class SingleScatteringTracer:
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
             vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
-            self.surfaces = image_method.CandidateSurfaces(vertices, stage.topology, ends)
+            occluders = vertices, stage.topology, ends, self.powers.transmit
+            self.surfaces = image_method.CandidateSurfaces(*occluders)
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
@@ -417,9 +418,9 @@ class SingleScatteringTracer:
         first, second = match_rows(outbound.rx, inbound.rx, len(area))
         ends, normal = ((outbound, first), (inbound, second)), strip_derivatives(point.normal)
         side = [dot(normal[leg.rx], strip_derivatives(leg.arrival))[n] > 0 for leg, n in ends]
-        has_reflection = [(leg.kinds == REFLECTION).any(1)[n] for leg, n in ends]
-        kept = outbound.depth[first] + inbound.depth[second] < self.depth
-        kept &= (has_reflection[0] | has_reflection[1]) & (side[0] == side[1])
+        reflections = [(leg.kinds == REFLECTION).sum(1)[n] for leg, n in ends]
+        total = reflections[0] + reflections[1]
+        kept = (total > 0) & (total < self.depth) & (side[0] == side[1])
         rows = torch.nonzero(kept)[:, 0]
         outbound, inbound = outbound.select(first[rows]), inbound.select(second[rows])
         index = outbound.rx

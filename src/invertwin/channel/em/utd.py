@@ -72,7 +72,7 @@ class EdgeDiffraction:
         distance_parameter: distance parameter L [m]; for a spherical wave s s′ sin²β/(s + s′).
         face_coefficients: reflection and transmission of the wedges' faces.
         end_parameters: √phase by which paths over the edge's ends are longer; None = infinite edge.
-        absorbing: True for faces that neither reflect nor transmit, whatever their material.
+        reflects: False for faces that do not reflect, whatever their material.
     """
 
     wedges: Wedges
@@ -83,7 +83,7 @@ class EdgeDiffraction:
     distance_parameter: _Reals
     face_coefficients: FaceCoefficients = conductor_coefficients
     end_parameters: Float64[Tensor, "row 2"] | None = None
-    absorbing: bool = False
+    reflects: bool = True
 
     def reverse(self) -> "EdgeDiffraction":
         """Return the same geometry with source and receiver exchanged."""
@@ -115,7 +115,7 @@ def diffraction_dyads(
         orders: the dyad, or its derivatives with respect to an azimuth.
     """
     forward = _directional_dyads(diffraction, wave_number, orders)
-    if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
+    if diffraction.face_coefficients is conductor_coefficients:
         return forward
     exchanged: dict[DyadDerivative, DyadDerivative] = {"value": "value", "in": "out", "out": "in"}
     others: list[DyadDerivative] = [exchanged[order] for order in orders]
@@ -258,24 +258,19 @@ def _directional_dyads(
 def _term_dyads(diffraction: EdgeDiffraction) -> Complex128[Tensor, "term row 3 3"]:
     """Dyads of the cotangent terms, averaged over both directions of propagation."""
     forward = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction)))
-    if diffraction.face_coefficients is conductor_coefficients or diffraction.absorbing:
+    if diffraction.face_coefficients is conductor_coefficients:
         return forward
     backward = torch.stack(torch.broadcast_tensors(*_directional_term_dyads(diffraction.reverse())))
     return (forward + backward.mT) / 2
 
 
 def _directional_term_dyads(diffraction: EdgeDiffraction) -> list[Complex128[Tensor, "row 3 3"]]:
-    if diffraction.absorbing:
-        axis = edge_axis(diffraction.wedges)
-        leaving = _ray_fixed_basis(axis, diffraction.diffracted_direction)
-        arriving = _ray_fixed_basis(axis, diffraction.incident_direction)
-        return [_rotate_dyad(leaving, arriving, torch.eye(3, dtype=torch.complex128))] * 2
     direct, *reflected = _geometric_optics_dyads(diffraction)
-    return [direct, direct, *reflected]
+    return [direct, direct, *(reflected if diffraction.reflects else ())]
 
 
 def _term_signs(diffraction: EdgeDiffraction) -> tuple[tuple[float, float], ...]:
-    return _TERM_SIGNS[:2] if diffraction.absorbing else _TERM_SIGNS
+    return _TERM_SIGNS if diffraction.reflects else _TERM_SIGNS[:2]
 
 
 def _dyad_scale(diffraction: EdgeDiffraction, wave_number: float) -> Tensor:

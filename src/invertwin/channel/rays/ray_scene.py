@@ -28,7 +28,7 @@ Points: TypeAlias = Float64[Tensor, "n 3"]
 # that the shadowed side of a 0.3 m ball stays dark from a kilometre away.
 RAY_EPSILON = 3e-6
 NO_TARGET = 0xFFFFFFFF  # index of no object
-_MAX_SHEETS = 8  # that a segment may pass
+MAX_SHEETS = 8  # that a segment may pass
 _SEAM = 4e-6  # of the scene's size: triangles that a ray meets so close are one sheet
 _MIN_RELATIVE_AREA = 1e-3  # least area over squared sides of a triangle that is not a sliver
 _SHADOW_MARGIN = 1e-4  # relative to a distance: far more than rounding
@@ -521,7 +521,7 @@ def find_passed_sheets(
     clear, passed = torch.zeros(len(start), dtype=torch.bool), list[tuple[Tensor, Tensor]]()
     row, last = torch.arange(len(start)), torch.full((len(start),), -1)
     seam = _SEAM * float(rays.local_vertices.abs().amax())
-    while len(row) and len(passed) <= _MAX_SHEETS:
+    while len(row) and len(passed) <= MAX_SHEETS:
         face, share = find_next_surface(rays, start, end[row])
         clear[row[face < 0]] = True
         # After rounding a ray may meet the triangle that it has passed, or its neighbour.

@@ -1,7 +1,7 @@
 """Candidate sequences of surfaces for specular paths: exhaustive, or found by shooting rays.
 
-A step of a sequence is a plane with an interaction: 2·plane for a reflection, 2·plane + 1 for a
-transmission.
+A step of a sequence is the plane of a reflection. Sheets that transmit are passed on the way: they
+do not bend a path and are no steps, so that they use up nothing of the depth.
 """
 
 import math
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import reflect_vectors
+from invertwin.channel.rays.ray_scene import MAX_SHEETS
 from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces, Planes
 from invertwin.runtime.memory import require_at_most
 
@@ -62,10 +63,7 @@ def enumerate_sequences(
     Raises:
         InputError: more than a million sequences.
     """
-    known = planes.face_plane >= 0
-    mirrors = 2 * planes.face_plane[interactions.reflect & known]
-    sheets = 2 * planes.face_plane[interactions.transmit & known] + 1
-    options = torch.cat([mirrors, sheets]).unique()
+    options = planes.face_plane[interactions.reflect & (planes.face_plane >= 0)].unique()
     count = sum(len(options) ** step for step in range(1, depth + 1))
     what = f"sequences to test one by one (of {len(planes)} planes, depth {depth})"
     require_at_most(count, _MAX_SEQUENCES, what, "give a number of rays, or a smaller depth")
@@ -74,7 +72,7 @@ def enumerate_sequences(
         row = torch.arange(len(last)).repeat_interleave(len(options))
         grown = torch.cat([last[row], options.repeat(len(last))[:, None]], 1)
         if grown.shape[1] > 1:
-            grown = grown[grown[:, -1] // 2 != grown[:, -2] // 2]
+            grown = grown[grown[:, -1] != grown[:, -2]]
         found.append(grown)
         last = grown
     return CandidateSequences(tuple(found), None)
@@ -90,7 +88,7 @@ def find_sequences(
 ) -> CandidateSequences:
     """Find candidate sequences of up to ``depth`` steps by shooting rays, or enumerate all.
 
-    Directions form a golden spiral, rotated at random for every origin. At a surface that reflects
+    Directions form a golden spiral, rotated at random for every origin. At a sheet that reflects
     and transmits, a ray splits. A sequence that subtends the solid angle Ω at the antenna is missed
     by all of N independent random directions with the probability (1 − Ω/4π)^N < exp(−NΩ/4π);
     evenly spread directions miss less.
@@ -163,6 +161,9 @@ def shoot_sequences_from_edges(
 
 def _split_by_length(leaves: Tensor, first: int) -> tuple[Tensor, ...]:
     """Distinct sequences of each length, in tables of ``first`` columns and more."""
+    # After rounding a ray may meet the plane that it has just left.
+    repeated = (leaves[:, first:] == leaves[:, first - 1 : -1]) & (leaves[:, first:] >= 0)
+    leaves = leaves[~repeated.any(1)]
     widths = range(first, leaves.shape[1] + 1)
     found = (leaves[leaves[:, width - 1] >= 0, :width] for width in widths)
     return tuple(some.unique(dim=0) if len(some) else some for some in found)
@@ -197,27 +198,26 @@ def _follow_rays(
     ended: list[tuple[Tensor, Tensor]] = []
     width = prefixes.shape[1] + depth
     for step in range(depth):
-        if step:
-            origin = origin + surfaces.margin * direction
-        face, distance = surfaces.find_first_hits(origin, direction)
-        hit = (face >= 0) & (face_plane[face.clamp_min(0)] >= 0)
-        ended.append((prefixes, parent[~hit]))
-        point = origin + distance.to(torch.float32)[:, None] * direction
-        parent, face, point, direction = (x[hit] for x in (parent, face, point, direction))
-        branches = []
-        for mask, next_direction, bit in (
-            (interactions.reflect, reflect_vectors(direction, normals[face_plane[face]]), 0),
-            (interactions.transmit, direction, 1),
-        ):
-            chosen = mask[face]
-            code = 2 * face_plane[face[chosen]] + bit
-            branches.append((parent[chosen], code, point[chosen], next_direction[chosen]))
-        stops = ~(interactions.reflect[face] | interactions.transmit[face])
-        ended.append((prefixes, parent[stops]))
-        columns = zip(*branches, strict=True)
-        parent, code, origin, direction = (torch.cat(column) for column in columns)
-        options = 2 * len(surfaces.planes)
-        pair, parent = (parent * options + code).unique(return_inverse=True)
+        branches: list[tuple[Tensor, ...]] = []
+        for passed in range(MAX_SHEETS + 1):
+            if step or passed:
+                origin = origin + surfaces.margin * direction
+            face, distance = surfaces.find_first_hits(origin, direction)
+            hit = (face >= 0) & (face_plane[face.clamp_min(0)] >= 0)
+            ended.append((prefixes, parent[~hit]))
+            point = origin + distance.to(torch.float32)[:, None] * direction
+            parent, face, point, direction = (x[hit] for x in (parent, face, point, direction))
+            reflects, transmits = interactions.reflect[face], interactions.transmit[face]
+            ended.append((prefixes, parent[~(reflects | transmits)]))
+            reflected = reflect_vectors(direction, normals[face_plane[face]])
+            columns = parent, face_plane[face], point, reflected
+            branches.append(tuple(column[reflects] for column in columns))
+            parent, origin, direction = (x[transmits] for x in (parent, point, direction))
+            if not len(parent):
+                break
+        parent, plane, origin, direction = map(torch.cat, zip(*branches, strict=True))
+        options = len(surfaces.planes)
+        pair, parent = (parent * options + plane).unique(return_inverse=True)
         prefixes = torch.cat([prefixes[pair // options], (pair % options)[:, None]], 1)
         if step == depth - 1:
             ended.append((prefixes, parent))

@@ -77,13 +77,12 @@ def evaluate_diffracted_paths(
         wave_number: wave number k [1/m].
     """
     source, target = tx[candidates.tx], rx[candidates.rx]
-    after = PathLegs(candidates.after.faces.flip(1), candidates.after.transmitted.flip(1))
-    sides = (candidates.before, source), (after, target)
+    sides = (candidates.before, source), (candidates.after.reverse(), target)
     legs = [_AntennaLeg(wedge_scene, *side) for side in sides]
     angles = diffraction_candidates.face_azimuths(wedge_scene, candidates)
     incidence, departure = [None, *angles[..., 1].T], [*angles[..., 0].T, None]
     edges = [
-        wedge_scene.path_edge(row, pair, absorbing=candidates.absorbing)
+        wedge_scene.path_edge(row, pair, reflects=candidates.reflects)
         for row, pair in zip(candidates.edge.T, zip(incidence, departure, strict=True), strict=True)
     ]
     found = _edge_fields(candidates, edges, legs[0].image, legs[1].image, wave_number)

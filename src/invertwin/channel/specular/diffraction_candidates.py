@@ -1,6 +1,6 @@
 """Candidate diffracted paths: one edge with surfaces before and after it, or up to three edges.
 
-Surfaces reflect or transmit; the search has no derivatives. A path over one edge connects two
+Sheets are passed on the way; the search has no derivatives. A path over one edge connects two
 images: that of the transmitter in the planes before the edge, and that of the receiver in those
 after it. It exists where both of its legs are unobstructed. Every sharp edge contributes at every
 receiver with an unobstructed path over it, also if the diffraction point lies beyond the end of the
@@ -9,9 +9,9 @@ an edge, and sums over the edges of a plate have no jump at its corners.
 
 Source: derivations §9.
 
-Differs from the source: where a path has the maximum number of surfaces, its edge's faces neither
-reflect nor transmit. Waves of one surface more are not traced, and the diffracted terms that
-compensate for their boundaries would jump.
+Differs from the source: where a path has the maximum number of reflections, its edge's faces do not
+reflect. Waves of one reflection more are not traced, and the diffracted terms that compensate for
+their boundaries would jump.
 """
 
 from collections.abc import Iterator
@@ -57,6 +57,10 @@ class PathLegs(Rows):
     faces: Int64[Tensor, "row step"]
     transmitted: Bool[Tensor, "row step"]
 
+    def reverse(self) -> "PathLegs":
+        """Return the legs in the opposite order."""
+        return PathLegs(self.faces.flip(1), self.transmitted.flip(1))
+
     @property
     def kinds(self) -> Int64[Tensor, "row step"]:
         """Interaction types, numbers of ``KINDS``."""
@@ -72,7 +76,7 @@ class DiffractionCandidates(Rows):
         edge: edge numbers, from the transmitter on.
         before, after: surfaces before the first edge and after the last.
         between: faces of both edges along which a leg between edges runs (−1: none).
-        absorbing: True if the edge's faces neither reflect nor transmit, at the maximum depth.
+        reflects: False if the edge's faces do not reflect, at the maximum depth.
         corner: "first" or "last" if that edge is met in a corner, where its neighbour ends.
         end: end of that neighbour, 0 or 1.
     """
@@ -83,7 +87,7 @@ class DiffractionCandidates(Rows):
     before: PathLegs
     after: PathLegs
     between: Int64[Tensor, "row leg 2"]
-    absorbing: bool = False
+    reflects: bool = True
     corner: Corner = None
     end: Int64[Tensor, " row"] | None = None
 
@@ -98,14 +102,14 @@ def find_diffraction_candidates(
     rays: int | None,
     seed: int,
 ) -> Iterator[DiffractionCandidates]:
-    """Find paths over one edge with up to ``depth`` surfaces, and over more edges without surfaces.
+    """Find paths over one edge with up to ``depth`` reflections, and over more without surfaces.
 
     Args:
         wedge_scene: scene with sharp edges.
         interactions: interactions of the triangles.
         tx, rx: antenna positions [m].
         order: maximum number of edges on a path, 0 to 3.
-        depth: maximum number of surfaces on a path over one edge.
+        depth: maximum number of reflections on a path over one edge.
         rays: number of rays from all edges together; None tests every sequence.
         seed: random seed of the rays.
     """
@@ -145,7 +149,7 @@ def _edge_sequences(
         points = wedge_scene.offset_points(edge, points)
         tables += shoot_sequences_from_edges(surfaces, interactions, points, edge, depth, seed)
     # Planes that contain the edge are its faces.
-    own = [_lies_in_plane(wedge_scene, table[:, 0], table[:, 1] >> 1) for table in tables[1:]]
+    own = [_lies_in_plane(wedge_scene, table[:, 0], table[:, 1]) for table in tables[1:]]
     return [tables[0], *(table[~mask] for table, mask in zip(tables[1:], own, strict=True))]
 
 
@@ -165,7 +169,7 @@ class _VisibleEdges(Rows):
 
     Attributes:
         antenna, edge: antenna and edge numbers.
-        steps: planes and interactions from the edge to the antenna.
+        steps: planes of the reflections, from the edge to the antenna.
         image: image of the antenna in these planes [m].
         position: position of the antenna [m].
     """
@@ -208,7 +212,7 @@ def _may_cross_planes(
     keep, decidable = torch.ones(2, len(steps), dtype=torch.bool).unbind(0)
     points = list(ends)
     for step in reversed(range(steps.shape[1])):
-        plane = steps[:, step] >> 1
+        plane = steps[:, step]
         point, normal = planes.point[plane], planes.normal[plane]
         local, valid = [], []
         for number, end in enumerate(points):
@@ -246,19 +250,23 @@ def _diffract_once(
             steps, end = side.steps[rows].flip(1), beside[rows] - surfaces.origin
             images = surfaces.images(side.position[rows], steps)
             valid[rows] = image_method.intersects_planes(surfaces, steps, images, end)
-        faces = [torch.full_like(side.steps, -1) for side in (outbound, inbound)]
-        for side, side_faces in zip((outbound, inbound), faces, strict=True):
-            rows = torch.nonzero(valid)[:, 0]
-            valid[rows], side_faces[rows] = image_method.find_unobstructed_paths(
-                surfaces, side.steps[rows].flip(1), side.position[rows], beside[rows]
+        rows, legs = torch.nonzero(valid)[:, 0], list[tuple[Tensor, Tensor]]()
+        for side in (outbound, inbound):
+            part = side.select(rows)
+            path = part.steps.flip(1), part.position, beside[rows]
+            clear, *leg = image_method.find_unobstructed_paths(surfaces, *path)
+            rows, legs = rows[clear], [(f[clear], t[clear]) for f, t in (*legs, leg)]
+        numbers = outbound.antenna[rows], inbound.antenna[rows], outbound.edge[rows, None]
+        lengths = torch.stack([(faces >= 0).sum(1) for faces, _ in legs], 1)
+        for own in lengths.unique(dim=0):
+            chosen = torch.nonzero((lengths == own).all(1))[:, 0]
+            before, after = (
+                PathLegs(faces[chosen, :length], transmitted[chosen, :length])
+                for (faces, transmitted), length in zip(legs, own.tolist(), strict=True)
             )
-        if bool(valid.any()):
-            numbers = outbound.antenna, inbound.antenna, outbound.edge[:, None]
-            before = PathLegs(faces[0], (outbound.steps.flip(1) & 1).bool())
-            after = PathLegs(faces[1].flip(1), (inbound.steps & 1).bool())
-            legs = before, after, torch.full((len(outbound.edge), 0, 2), -1)
-            found = DiffractionCandidates(*numbers, *legs, absorbing=count == depth > 0)
-            yield found.select(torch.nonzero(valid)[:, 0])
+            ends, none = (number[chosen] for number in numbers), torch.full((len(chosen), 0, 2), -1)
+            last = 0 < depth == count
+            yield DiffractionCandidates(*ends, before, after.reverse(), none, reflects=not last)
 
 
 def _match_edges(

@@ -45,7 +45,7 @@ class PathEdge:
         face_coefficients: field coefficients of the faces.
         azimuth_in, azimuth: known φ′ and φ, NaN where unknown [rad]; None = unknown in all rows.
         infinite: True for edges of infinite length.
-        absorbing: True for faces that neither reflect nor transmit.
+        reflects: False for faces that do not reflect.
     """
 
     wedges: Wedges
@@ -53,7 +53,7 @@ class PathEdge:
     azimuth_in: Float64[Tensor, " row"] | None = None
     azimuth: Float64[Tensor, " row"] | None = None
     infinite: bool = False
-    absorbing: bool = False
+    reflects: bool = True
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class Route:
             angles = azimuth_in, _azimuth(wedges, diffracted, edge.azimuth)
             length = parameters[:, number] * cross(edge_axis(wedges), incident).square().sum(1)
             ends = None if edge.infinite else self.end_parameters(number, wave_number)
-            law = edge.face_coefficients, ends, edge.absorbing
+            law = edge.face_coefficients, ends, edge.reflects
             found.append(utd.EdgeDiffraction(wedges, incident, diffracted, *angles, length, *law))
         return found
 

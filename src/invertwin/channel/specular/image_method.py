@@ -2,7 +2,7 @@
 
 The transmitter is reflected at one plane after another. The straight lines from the receiver to
 these images intersect the planes at the interaction points of the path. A path exists if each such
-point lies on a triangle of its plane, and no triangle lies between the points.
+point lies on a triangle of its plane, and nothing but sheets that transmit lies between the points.
 
 Rays are float32, and may pass through the seam of two triangles. Every segment is therefore tested
 by four slightly shifted rays, and where they disagree, a float64 test over all triangles decides.
@@ -25,7 +25,7 @@ from torch.nn.functional import normalize
 from invertwin.channel.em import plane_waves as waves
 from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi
-from invertwin.channel.rays.ray_scene import RAY_EPSILON, Occluders
+from invertwin.channel.rays.ray_scene import MAX_SHEETS, RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, bound_groups
 
@@ -48,6 +48,7 @@ class CandidateSurfaces(Occluders):
         vertices: vertex positions in world axes, detached [m].
         topology: triangles of the vertices.
         antennas: antenna positions in world axes [m].
+        sheets: mask of triangles that transmit.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class CandidateSurfaces(Occluders):
         vertices: Float64[Tensor, "v 3"],
         topology: Topology,
         antennas: Float64[Tensor, "antenna 3"],
+        sheets: Bool[Tensor, " f"],
     ) -> None:
         ends = torch.cat([vertices, antennas])
         super().__init__(vertices, topology, (ends.amax(0) + ends.amin(0)) / 2)
@@ -62,12 +64,14 @@ class CandidateSurfaces(Occluders):
         self.size = float((ends - self.origin).norm(dim=1).max())
         self.margin = RAY_EPSILON * self.size
         self.planes: Planes = find_planes(self.exact_vertices, topology.faces)
+        self.sheets = sheets
 
     @cached_property
     def device_planes(self) -> dict[str, Any]:
         """Planes as flat Dr.Jit arrays."""
         names = ("point", "normal", "axes", "low", "high")
         tables = {name: arrays.to_double(getattr(self.planes, name)) for name in names}
+        tables["is_sheet"] = arrays.to_index(self.sheets)
         return tables | {"of_face": arrays.to_index(self.planes.face_plane.clamp_min(0))}
 
     @cached_property
@@ -84,10 +88,10 @@ class CandidateSurfaces(Occluders):
 
         Args:
             positions: positions in world axes [m].
-            steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
+            steps: planes of the reflections, in order.
         """
-        point, normal = self.planes.point[steps >> 1], self.planes.normal[steps >> 1]
-        return image_positions(positions - self.origin, point, normal, (steps & 1).bool())
+        point, normal = self.planes.point[steps], self.planes.normal[steps]
+        return image_positions(positions - self.origin, point, normal, torch.zeros_like(steps).bool())
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,7 @@ def find_paths_from(
 
     Args:
         surfaces: candidate surfaces of the scene.
-        steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
+        steps: planes of the reflections, in order.
         sources, targets: positions in world axes [m].
         source_index: number of the source of each target.
         target_planes: plane that each target lies in, −1 = none; None = none for all.
@@ -260,9 +264,12 @@ def find_paths_from(
             chosen, source = part[sequence], source_index[target]
             plane = None if target_planes is None else target_planes[target]
             ends = sources[source], targets[target]
-            valid, faces = find_unobstructed_paths(surfaces, chosen, *ends, plane)
-            transmitted = (chosen[valid] & 1).bool()
-            found.append(SpecularPaths(source[valid], target[valid], faces[valid], transmitted))
+            valid, faces, transmitted = find_unobstructed_paths(surfaces, chosen, *ends, plane)
+            length = torch.where(valid, (faces >= 0).sum(1), -1)
+            for count in length[valid].unique().tolist() or [part.shape[1]]:
+                rows, own = length == count, slice(count)
+                paths = source[rows], target[rows], faces[rows, own], transmitted[rows, own]
+                found.append(SpecularPaths(*paths))
     return found
 
 
@@ -304,8 +311,7 @@ class _SequenceScreen:
         active, position = mi.Bool(True), end
         corners, planes, normals = [], [], []
         for step in reversed(range(self.length)):
-            code = dr.gather(mi.UInt32, self.steps, row * self.length + step)
-            plane, transmitted = code >> 1, (code & 1) == 1
+            plane = dr.gather(mi.UInt32, self.steps, row * self.length + step)
             point = dr.gather(mi.Vector3d, table["point"], plane)
             normal = dr.gather(mi.Vector3d, table["normal"], plane)
             direction = dr.gather(mi.Vector3d, self.images, first + step + 1) - position
@@ -314,9 +320,8 @@ class _SequenceScreen:
             fraction = dr.dot(point - position, normal) / dr.select(slope != 0, slope, 1.0)
             length = dr.norm(direction)
             distance = fraction * length
-            # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
-            active &= distance > dr.select(transmitted, tolerance, -tolerance)
-            active &= distance < length - tolerance
+            # A receiver in a reflecting plane has a reflection.
+            active &= (distance > -tolerance) & (distance < length - tolerance)
             position = position + fraction * direction
             for axis in (2 * plane, 2 * plane + 1):
                 at = dr.dot(position - point, dr.gather(mi.Vector3d, table["axes"], axis))
@@ -332,7 +337,7 @@ class _SequenceScreen:
     ) -> Any:
         """Test each segment with one ray: unobstructed, and ending on the expected plane.
 
-        Hits near the rim of a triangle are left to the exact test.
+        Hits of sheets, and near the rim of a triangle, are left to the exact test.
         """
         surfaces = self.surfaces
         margin, scene = arrays.opaque(surfaces.margin, "Float64"), surfaces.scene
@@ -358,7 +363,9 @@ class _SequenceScreen:
             u, v = hit.prim_uv.x, hit.prim_uv.y
             rim = dr.gather(mi.Float, surfaces.device_rim_widths, hit.prim_index, valid)
             is_inside = valid & (dr.minimum(dr.minimum(u, v), 1 - u - v) > rim)
-            plane = dr.gather(mi.UInt32, surfaces.device_planes["of_face"], hit.prim_index, valid)
+            table, face = surfaces.device_planes, hit.prim_index
+            is_inside &= dr.gather(mi.UInt32, table["is_sheet"], face, valid) == 0
+            plane = dr.gather(mi.UInt32, table["of_face"], face, valid)
             if step:
                 is_inside &= plane != planes[step - 1]
             if last:
@@ -392,11 +399,11 @@ def intersects_planes(
 
     Args:
         surfaces: candidate surfaces of the scene.
-        steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
+        steps: planes of the reflections, in order.
         images: result of ``image_positions``, relative to the scene's origin [m].
         target: positions relative to the scene's origin [m].
     """
-    planes, plane, transmitted = surfaces.planes, steps >> 1, (steps & 1).bool()
+    planes, plane = surfaces.planes, steps
     point, normal = planes.point[plane], planes.normal[plane]
     nodes = torch.stack([*interaction_points(target, images, point, normal), target], 1)
     start, ray = nodes[:, 1:], torch.stack(images, 1)[:, 1:] - nodes[:, 1:]
@@ -407,9 +414,9 @@ def intersects_planes(
         at <= planes.high[plane] + surfaces.margin
     )
     tolerance = _EXACT_TOLERANCE * surfaces.size
-    # A receiver in a reflecting plane has a reflection; one in a sheet is not behind it.
-    valid = (slope != 0) & (distance > torch.where(transmitted, tolerance, -tolerance))
-    return (valid & (distance < length - tolerance) & inside.all(2)).all(1)
+    # A receiver in a reflecting plane has a reflection.
+    valid = (slope != 0) & (distance > -tolerance) & (distance < length - tolerance)
+    return (valid & inside.all(2)).all(1)
 
 
 def find_unobstructed_paths(
@@ -418,19 +425,22 @@ def find_unobstructed_paths(
     source: PathVectors,
     targets: PathVectors,
     target_planes: Int64[Tensor, " row"] | None = None,
-) -> tuple[Bool[Tensor, " row"], _StepNumbers]:
-    """Find unobstructed paths along given planes, and the triangles of their interactions.
+) -> tuple[Bool[Tensor, " row"], Int64[Tensor, "row vertex"], Bool[Tensor, "row vertex"]]:
+    """Find paths that reflect at given planes, and that nothing but sheets obstructs.
 
     Args:
         surfaces: candidate surfaces of the scene.
-        steps: sequences, 2·plane + 1 for a transmission, 2·plane for a reflection.
+        steps: planes of the reflections, in order.
         source, targets: positions in world axes [m].
         target_planes: plane that each target lies in, −1 = none; None = none for all.
+
+    Returns:
+        Mask of paths; their triangles from the source on, sheets included, padded with −1 at the
+        end; and a mask of those that transmit.
     """
-    count, length = steps.shape
+    count, planes, plane = len(steps), surfaces.planes, steps
     if not count:
-        return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps)
-    planes, plane = surfaces.planes, steps >> 1
+        return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps), steps.bool()
     point, normal = planes.point[plane], planes.normal[plane]
     images, target = surfaces.images(source, steps), targets - surfaces.origin
     nodes = torch.stack([images[0], *interaction_points(target, images, point, normal), target], 1)
@@ -440,45 +450,55 @@ def find_unobstructed_paths(
     last = torch.cat([torch.full_like(plane, -1), target_plane], 1)
     starts, ends = nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3)
     segments = _SpecularSegments(starts, ends, before.ravel(), after.ravel(), last.ravel())
-    faces, valid = _test_segments(surfaces, segments)
-    faces, valid = faces.view(count, length + 1), valid.view(count, length + 1)
+    faces, valid, passed = _test_segments(surfaces, segments)
+    transmits = torch.tensor([True] * passed.shape[1] + [False]).repeat(count, steps.shape[1] + 1)
+    faces = torch.cat([passed, faces[:, None]], 1).view(count, -1)
+    order = (faces < 0).to(torch.int8).sort(dim=1, stable=True).indices
+    faces, transmits = faces.gather(1, order), transmits.gather(1, order)
+    valid = valid.view(count, -1).all(1) & (((faces >= 0) & transmits).sum(1) <= MAX_SHEETS)
     separate = (target - images[-1]).norm(dim=1) > _EXACT_TOLERANCE * surfaces.size
-    return valid.all(1) & separate, faces[:, :length]
+    return valid & separate, faces, transmits
 
 
 def is_unobstructed(
     surfaces: CandidateSurfaces, start: PathVectors, end: PathVectors
 ) -> Bool[Tensor, " row"]:
-    """Mask of unobstructed straight lines.
+    """Mask of straight lines that no surface obstructs, sheets included.
 
     Args:
         surfaces: candidate surfaces of the scene.
         start, end: positions in world axes [m].
     """
-    return find_unobstructed_paths(surfaces, DIRECT.expand(len(start), 0), start, end)[0]
+    direct = DIRECT.expand(len(start), 0)
+    valid, faces, _ = find_unobstructed_paths(surfaces, direct, start, end)
+    return valid & (faces < 0).all(1)
 
 
 def _test_segments(
     surfaces: CandidateSurfaces, segments: _SpecularSegments
-) -> tuple[Tensor, Tensor]:
-    """Return the triangle at the end of each segment, and a mask of unobstructed segments."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Triangle at the end of each segment, mask of unobstructed segments, and the sheets passed."""
     unit = normalize(segments.end - segments.start, dim=1)
     first = waves.orthogonal_unit_vectors(unit)
     second = waves.cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
-    faces, end_plane = torch.full_like(votes, -1), segments.plane.maximum(segments.target_plane)
+    end_plane = segments.plane.maximum(segments.target_plane)
+    tables: list[Tensor] = []
     for number in range(4):
         spread = _RAY_SPREAD * surfaces.margin * (number < 3)  # the last ray is not shifted
         offset = spread * (math.cos(2.1 * number) * first + math.sin(2.1 * number) * second)
         start = segments.start + _shift_in_plane(surfaces, offset, unit, segments.plane_before)
         end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
-        faces = _cast_rays(surfaces, start, end, segments)
+        faces, passed = _cast_rays(surfaces, start, end, segments)
         votes += torch.where(segments.plane >= 0, faces >= 0, faces == -1)
-    undecided = torch.nonzero((votes > 0) & (votes < 4))[:, 0]
+        tables.append(surfaces.planes.face_plane[passed].where(passed >= 0, -1))
+    agree = (torch.stack(tables) == tables[0]).all(2).all(0)
+    undecided = torch.nonzero((votes > 0) & ~((votes == 4) & agree))[:, 0]
     valid = votes == 4
     if len(undecided):
-        valid[undecided], faces[undecided] = _test_exactly(surfaces, segments.select(undecided))
-    return faces, valid
+        exact = _test_exactly(surfaces, segments.select(undecided), passed.shape[1])
+        valid[undecided], faces[undecided], passed[undecided] = exact
+    return faces, valid, passed
 
 
 def _shift_in_plane(
@@ -494,8 +514,11 @@ def _shift_in_plane(
 
 def _cast_rays(
     surfaces: CandidateSurfaces, start: Tensor, end: Tensor, segments: _SpecularSegments
-) -> Tensor:
-    """Triangle of the expected plane at each segment's end; −1 = no hit, −2 = another hit."""
+) -> tuple[Tensor, Tensor]:
+    """Triangle of the expected plane at each segment's end, and the sheets that rays pass.
+
+    The triangle is −1 without a hit, −2 for another hit; the table of sheets is padded with −1.
+    """
     planes, margin = surfaces.planes, surfaces.margin
     direction_vector = end - start
     length = direction_vector.norm(dim=1)
@@ -506,23 +529,46 @@ def _cast_rays(
     slope = waves.dot(unit, planes.normal[end_plane.clamp_min(0)]).abs()
     excess = 2 * margin / slope.clamp_min(1e-3)
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
-    reach = (length + excess).clamp_min(0.0)
-    face, distance = surfaces.find_first_hits(start + offset[:, None] * before, unit, reach)
-    expected = (face >= 0) & (planes.face_plane[face.clamp_min(0)] == segments.plane)
-    expected &= distance > length - excess
-    return torch.where(expected | (face < 0), face, -2)
+    start, reach = start + offset[:, None] * before, (length + excess).clamp_min(0.0)
+    found, row, last = (
+        torch.full_like(end_plane, -2),
+        torch.arange(len(unit)),
+        segments.plane_before,
+    )
+    width, gone = MAX_SHEETS if bool(surfaces.sheets.any()) else 0, torch.zeros_like(length)
+    passed = torch.full((len(unit), width), -1)
+    for number in range(width + 1):
+        origin, left = start[row] + gone[:, None] * unit[row], reach[row] - gone
+        face, distance = surfaces.find_first_hits(origin, unit[row], left)
+        gone, plane = gone + distance, planes.face_plane[face.clamp_min(0)]
+        expected = (plane == segments.plane[row]) & (gone > (length - excess)[row])
+        ends = (face < 0) | expected
+        found[row[ends]] = face[ends]
+        through = torch.nonzero(~ends & surfaces.sheets[face.clamp_min(0)])[:, 0]
+        if number == width or not len(through):
+            break
+        # After rounding a ray may meet the plane that it has passed.
+        fresh = through[plane[through] != last[through]]
+        passed[row[fresh], number] = face[fresh]
+        row, last, gone = row[through], plane[through], gone[through] + margin
+    return found, passed
 
 
 def _test_exactly(
-    surfaces: CandidateSurfaces, segments: _SpecularSegments
-) -> tuple[Tensor, Tensor]:
-    """Test segments in float64 over all triangles, which include their edges."""
+    surfaces: CandidateSurfaces, segments: _SpecularSegments, width: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Test segments in float64 over all triangles, which include their edges.
+
+    Returns:
+        Mask of unobstructed segments, triangles at their ends, and up to ``width`` sheets on each.
+    """
     own, corners = surfaces.planes.face_plane, surfaces.exact_vertices[surfaces.topology.faces]
     a, b, c = corners.unbind(1)
     area, center = waves.cross(b - a, c - a), (a + b + c) / 3
     radius = (corners - center[:, None]).norm(dim=2).amax(1) + surfaces.margin
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces, least = torch.full((len(valid),), -1), torch.full((len(valid),), -torch.inf).double()
+    passed = torch.full((len(valid), width), -1)
     tolerance, rim = _EXACT_TOLERANCE * surfaces.size, 1e-9
     # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
     gap = torch.where(segments.plane.maximum(segments.target_plane) < 0, surfaces.margin, tolerance)
@@ -542,7 +588,14 @@ def _test_exactly(
         crossing = torch.nonzero(between & (slope != 0) & ~ends & (plane >= 0))[:, 0]
         point = start + fraction[:, None] * (end - start)
         inner = waves.barycentric_coordinates(corners[face[crossing]], point[crossing]).amin(1)
-        valid[row[crossing[inner >= -rim]]] = False
+        crossing = crossing[inner >= -rim]
+        is_sheet = surfaces.sheets[face[crossing]]
+        valid[row[crossing[~is_sheet]]] = False
+        crossing = crossing[is_sheet]
+        number, sheet, place = _number_crossings(row[crossing], plane[crossing], fraction[crossing])
+        valid[number[place >= width]] = False
+        kept = place < width
+        passed[number[kept], place[kept]] = face[crossing[sheet[kept]]]
         own_plane = torch.nonzero((plane == segments.plane[row]) & (plane >= 0))[:, 0]
         row, face = row[own_plane], face[own_plane]
         inner = waves.barycentric_coordinates(corners[face], end[own_plane]).amin(1)
@@ -550,7 +603,22 @@ def _test_exactly(
         best = inner == least[row]
         hit_faces[row[best]] = face[best]
     surface = segments.plane >= 0
-    return valid & (~surface | (least >= -rim)), hit_faces
+    return valid & (~surface | (least >= -rim)), hit_faces, passed
+
+
+def _number_crossings(
+    row: Tensor, plane: Tensor, fraction: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Number the planes that each segment crosses in order; triangles of one plane count once.
+
+    Returns:
+        Number of the segment, of the crossing, and of the place on the segment, from zero.
+    """
+    order = torch.from_numpy(np.lexsort((fraction.numpy(), row.numpy())))
+    pairs = torch.stack([row, plane], 1)[order].numpy()
+    order = order[np.sort(np.unique(pairs, axis=0, return_index=True)[1])]
+    row = row[order]
+    return row, order, torch.arange(len(row)) - torch.searchsorted(row, row)
 
 
 @dataclass(frozen=True)

@@ -112,9 +112,10 @@ def trace_paths(
         tx: transmitter positions, [3] or [tx, 3], in world axes [m].
         rx: receiver positions, [3] or [rx, 3], in world axes [m].
         frequency: carrier frequency of the coefficients [Hz].
-        depth: maximum number of surfaces on a path, 0 to 6; a transmitting sheet counts as one.
-        edges: maximum number of edges on a path, 0 to 3. Paths over one edge also meet up to
-            ``depth`` surfaces; over two or three, none.
+        depth: maximum number of reflections on a path, 0 to 6. Up to 8 sheets on the way are
+            passed, and use up nothing of it.
+        edges: maximum number of edges on a path, 0 to 3. Paths over one edge also reflect up to
+            ``depth`` times and pass sheets; over two or three, they meet no surfaces.
         rays: number of rays from each antenna of the side with fewer, and from all edges together;
             None tests every sequence.
         seed: random seed of the rays' directions.
@@ -140,7 +141,8 @@ def trace_paths(
         with _DisableFuncTorch():
             bare = path_scene.detach()
             antennas = torch.cat([bare.tx, bare.rx])
-            surfaces = CandidateSurfaces(bare.vertices, bare.topology, antennas)
+            occluders = bare.vertices, bare.topology, antennas, interactions.transmit
+            surfaces = CandidateSurfaces(*occluders)
             specular, missed = _find_specular(bare, surfaces, interactions, limit, rays, seed)
             ends, options = (bare.tx, bare.rx), (edges, limit, rays, seed)
             wedges = _wedge_scene(bare, surfaces)

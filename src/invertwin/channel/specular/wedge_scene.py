@@ -73,7 +73,7 @@ class WedgeScene:
         row: Tensor,
         known_azimuths: tuple[Tensor | None, Tensor | None] = (None, None),
         *,
-        absorbing: bool = False,
+        reflects: bool = True,
     ) -> PathEdge:
         """Return edges for the evaluation of paths.
 
@@ -81,14 +81,14 @@ class WedgeScene:
             row: numbers of wedges.
             known_azimuths: azimuths of incidence and of diffraction, where a path runs along a
                 face.
-            absorbing: True for faces that neither reflect nor transmit.
+            reflects: False for faces that do not reflect.
         """
         wedges = self.wedges.select(row)
 
         def faces(face: int, cosine: Tensor) -> FieldCoefficients:
             return self.coefficients(wedges.faces[:, face], cosine)
 
-        return PathEdge(wedges, faces, *known_azimuths, absorbing=absorbing)
+        return PathEdge(wedges, faces, *known_azimuths, reflects=reflects)
 
     def offset_points(
         self, row: Tensor, points: Float64[Tensor, "row 3"]
