@@ -95,7 +95,7 @@ def step_at(
     start, way = line
 
     def there(share: float) -> int:
-        return len(of_kind(trace(around, rx=start + share * way, depth=depth, edges=0), steps))
+        return len(of_kind(trace(around, rx=start + share * way, edges=0), steps))
 
     low, high = 0.0, 1.0
     first = there(low)
@@ -107,7 +107,7 @@ def step_at(
     shares = float64([-2e-7, -1e-7, 1e-7, 2e-7]) + low
     places = start + shares[:, None] * way
     found, scale = [], 0.0
-    every: tuple[dict[str, Any], ...] = ({"depth": depth}, {"depth": depth, "edges": 0})
+    every: tuple[dict[str, Any], ...] = ({"depth": depth}, {"edges": 0})
     for options in every:
         field = response(trace(around, rx=places, **options))
         scale = scale or float(field[1].norm())
