@@ -62,7 +62,7 @@ class PropagationSettings:
         frequency: Carrier frequency [Hz].
         bandwidth: Bandwidth of the receivers [Hz]: powers are means over this band. 0 = fields are
             added at the carrier; None = powers of paths are added.
-        depth: Maximum number of interactions with surfaces per path, see ``trace_paths``.
+        depth: Maximum number of reflections per path, see ``trace_paths``.
         edges: Maximum number of edge diffractions per path.
         rays: Number of rays that search for sequences of surfaces; None = all sequences are tested.
         receivers: Antenna mount of every receiver; the power is the mean over its elements.

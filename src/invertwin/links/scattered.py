@@ -58,7 +58,7 @@ def scattered_moments(
         sampling: Numbers of paths, over all receivers; most bounces of a path that
             scatters at each.
         seed: Same seed, same paths.
-        depth: Most surfaces that a path with mirrors meets.
+        depth: Maximum number of reflections of a path, the scattering included.
         rays: Shot to find these mirrors; None tries every sequence.
 
     Raises:

@@ -48,7 +48,7 @@ def trace_point_targets(
         link: antennas, per frame, such as ``radar.link()``.
         targets: target positions, [target, 3], in world axes [m].
         cross_sections: radar cross-sections σ, [target] [m²].
-        depth: maximum number of surfaces on one leg.
+        depth: maximum number of reflections on one leg.
         rays: number of rays of the search; None tests every sequence.
         seed: random seed of the rays.
 
