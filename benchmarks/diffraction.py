@@ -72,14 +72,13 @@ from invertwin.channel.em.wedges import Wedges, edge_axis, exterior_azimuth
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import is_visible
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import FaceInteractions
 from invertwin.channel.specular.diffracted_paths import DiffractedPaths, evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import (
     DiffractionCandidates,
     find_diffraction_candidates,
 )
 from invertwin.channel.specular.edge_path_geometry import PathEdge, diffract_over_edges
-from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.image_method import CandidateSurfaces, FaceInteractions
 from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.constants import SPEED_OF_LIGHT
@@ -483,9 +482,9 @@ class Cube:
     def __init__(self, side: float) -> None:
         mesh = box((side, side, side))
         topology = topology_of([mesh])
-        walls = CandidateSurfaces(
-            mesh.vertices, topology, torch.tensor(PLACES, dtype=torch.float64)
-        )
+        none = FaceInteractions(*torch.zeros(2, len(topology.faces), dtype=torch.bool))
+        places = torch.tensor(PLACES, dtype=torch.float64)
+        walls = CandidateSurfaces(mesh.vertices, topology, places, none)
         self.half = side / 2
         self.around = WedgeScene(
             mesh.vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
@@ -514,12 +513,7 @@ class Cube:
 
     def bends(self, tx: Tensor, rx: Tensor, order: int) -> list[DiffractionCandidates]:
         """Paths round its edges."""
-        none = torch.zeros(len(self.around.topology.faces), dtype=torch.bool)
-        return list(
-            find_diffraction_candidates(
-                self.around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
-            )
-        )
+        return list(find_diffraction_candidates(self.around, tx, rx, order, 0, None, 0))
 
     def diffracted(self, tx: Tensor, rx: Tensor, order: int) -> list[DiffractedPaths]:
         """What they are worth."""

@@ -9,12 +9,11 @@ from invertwin.channel.em.utd import conductor_coefficients
 from invertwin.channel.em.wedges import Wedges
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import FaceInteractions
 from invertwin.channel.specular.corner_diffraction import diffract_round_corner
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import find_diffraction_candidates
 from invertwin.channel.specular.edge_path_geometry import PathEdge, diffract_over_edges
-from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.image_method import CandidateSurfaces, FaceInteractions
 from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.scene import box
 
@@ -97,16 +96,14 @@ def whole(tx, rx, order, *, corners=True):
     """What the edges of a box send."""
     mesh = box((5.0, 3.0, 4.0))
     topology = topology_of([mesh])
-    walls = CandidateSurfaces(mesh.vertices, topology, tx, torch.zeros(len(topology.faces)).bool())
+    none = FaceInteractions(*torch.zeros(2, len(topology.faces), dtype=torch.bool))
+    walls = CandidateSurfaces(mesh.vertices, topology, tx, none)
     around = WedgeScene(
         mesh.vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
     )
-    none = torch.zeros(len(topology.faces), dtype=torch.bool)
     total = torch.zeros(len(rx), 3, 3, dtype=torch.complex128)
     with tracing():
-        for bends in find_diffraction_candidates(
-            around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
-        ):
+        for bends in find_diffraction_candidates(around, tx, rx, order, 0, None, 0):
             if corners or bends.corner is None:
                 sent = evaluate_diffracted_paths(around, bends, tx, rx, K)
                 turn = torch.polar(torch.ones_like(sent.length), -K * sent.length)

@@ -9,10 +9,9 @@ from invertwin.channel.em.utd import conductor_coefficients
 from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.ray_scene import is_visible
 from invertwin.channel.rays.topology import topology_of
-from invertwin.channel.specular.candidates import FaceInteractions
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import find_diffraction_candidates
-from invertwin.channel.specular.image_method import CandidateSurfaces
+from invertwin.channel.specular.image_method import CandidateSurfaces, FaceInteractions
 from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.scene import Mesh, box
 from scenes import level_plate
@@ -25,7 +24,8 @@ def surroundings(*meshes, scale=1.0):
     """Conductors; a wavelength is a metre."""
     vertices = torch.cat([mesh.vertices for mesh in meshes]) * scale
     topology = topology_of(list(meshes))
-    walls = CandidateSurfaces(vertices.detach(), topology, TX[None], torch.zeros(len(topology.faces)).bool())
+    none = FaceInteractions(*torch.zeros(2, len(topology.faces), dtype=torch.bool))
+    walls = CandidateSurfaces(vertices.detach(), topology, TX[None], none)
     return WedgeScene(
         vertices, topology, walls, lambda _, cosine: conductor_coefficients(0, cosine)
     )
@@ -33,10 +33,7 @@ def surroundings(*meshes, scale=1.0):
 
 def sent_by(around, tx, rx, order=1):
     """What edges alone send, by their number from one to order."""
-    none = torch.zeros(len(around.topology.faces), dtype=torch.bool)
-    found = find_diffraction_candidates(
-        around, FaceInteractions(none, none), tx, rx, order, 0, None, 0
-    )
+    found = find_diffraction_candidates(around, tx, rx, order, 0, None, 0)
     return [evaluate_diffracted_paths(around, some, tx, rx, K) for some in found]
 
 

@@ -135,17 +135,16 @@ class _CoverageTracer:
         seed: int,
     ) -> None:
         self.measure, self.depth = measure, depth
-        self.tx, powers = strip_derivatives(stage.tx), trace_paths.face_interactions(stage)
-        self.powers = powers
+        self.tx, interactions = strip_derivatives(stage.tx), trace_paths.face_interactions(stage)
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
             places = strip_derivatives(surface.vertices)
             vertices, ends = strip_derivatives(stage.vertices), torch.cat([self.tx, places])
-            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends, powers.transmit)
+            self.surfaces = CandidateSurfaces(vertices, stage.topology, ends, interactions)
             own, origin = topology_of([surface]), self.surfaces.origin
             self.receiving_surface = shadow_boundaries.ReceivingSurface(places, own, origin)
             self.meshes = [*(item.mesh for item in stage.scene.objects.values()), surface]
-            self.sequences = find_sequences(self.surfaces, powers, self.tx, depth, rays, seed).steps
+            self.sequences = find_sequences(self.surfaces, self.tx, depth, rays, seed).steps
 
     def find_paths(self, points: Tensor) -> list[_PointBatch]:
         """Find the paths to points, in batches of points."""
@@ -186,7 +185,7 @@ class _CoverageTracer:
     ) -> list[CoverageBoundaryPaths]:
         """Boundary paths to illumination boundaries: path values times the boundary's area rate."""
         with _DisableFuncTorch():
-            search = self.receiving_surface, self.tx, self.sequences, self.powers
+            search = self.receiving_surface, self.tx, self.sequences
             groups = shadow_boundaries.sample_illumination_boundaries(
                 self.surfaces, *search, depth=self.depth, samples=samples, seed=seed
             )

@@ -26,7 +26,6 @@ from invertwin.channel.em.plane_waves import cross, dot, interpolate_vectors, re
 from invertwin.channel.rays.ray_scene import MAX_SHEETS, RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.rows import Rows, concatenate_rows
-from invertwin.channel.specular.candidates import FaceInteractions
 from invertwin.channel.specular.image_method import (
     CandidateSurfaces,
     SpecularPaths,
@@ -188,7 +187,6 @@ def sample_illumination_boundaries(
     receiver: ReceivingSurface | ReceivingTriangles,
     tx: Float64[Tensor, "tx 3"],
     sequences: tuple[Tensor, ...],
-    powers: FaceInteractions,
     *,
     depth: int,
     samples: int,
@@ -201,14 +199,13 @@ def sample_illumination_boundaries(
         receiver: surface or triangles that receive power.
         tx: transmitter positions in world axes, detached [m].
         sequences: candidate sequences from transmitter to edge, by length from 1.
-        powers: interactions of the triangles.
         depth: maximum number of reflections of a path; it passes up to 8 sheets.
         samples: number of points on edges, for each transmitter.
         seed: random seed of the points.
     """
     topology, found = surfaces.topology, list[IlluminationBoundarySamples]()
     for number, source in enumerate(tx):
-        casts = _casting_edges(surfaces, None if depth else source, powers)
+        casts = _casting_edges(surfaces, None if depth else source)
         start, end = surfaces.exact_vertices[topology.edges[casts]].unbind(1)
         row, *place = sample_along_curves((end - start).norm(dim=1), samples, seed, number)
         if not len(row):
@@ -220,7 +217,7 @@ def sample_illumination_boundaries(
         for part in paths:
             part = replace(part, source=part.source + number)
             for legs in _launch_past_edges(surfaces, source - surfaces.origin, y, ends, part):
-                for last, face in _follow_rays(surfaces, receiver, legs, powers, depth):
+                for last, face in _follow_rays(surfaces, receiver, legs, depth):
                     hits.setdefault(last.faces.shape[1], []).append((last, face))
         for part in hits.values():
             legs, faces = zip(*part, strict=True)
@@ -229,15 +226,12 @@ def sample_illumination_boundaries(
     return found
 
 
-def _casting_edges(
-    surfaces: CandidateSurfaces, source: Tensor | None, powers: FaceInteractions
-) -> Int64[Tensor, " edge"]:
+def _casting_edges(surfaces: CandidateSurfaces, source: Tensor | None) -> Int64[Tensor, " edge"]:
     """Return edges that can cast a boundary: where surfaces fold, on direct paths silhouettes.
 
     Args:
         surfaces: surfaces of the scene.
         source: transmitter position in world axes [m]; None = paths with interactions count, too.
-        powers: interactions of the triangles.
     """
     topology, planes = surfaces.topology, surfaces.planes.face_plane
     # Coplanar triangles of one object are one surface; the table is as wide as any edge needs.
@@ -253,7 +247,7 @@ def _casting_edges(
         casts &= (
             (height.amin(1) >= -tolerance)
             | (height.amax(1) <= tolerance)
-            | (is_there & powers.transmit[faces]).any(1)
+            | (is_there & surfaces.interactions.transmit[faces]).any(1)
         )
     return torch.nonzero(casts)[:, 0]
 
@@ -324,10 +318,10 @@ def _follow_rays(
     surfaces: CandidateSurfaces,
     receiver: ReceivingSurface | ReceivingTriangles,
     rays: _RaysPastEdges,
-    powers: FaceInteractions,
     depth: int,
 ) -> Iterator[tuple[_RaysPastEdges, Tensor]]:
     """Follow rays through the scene to the surface: last legs with the triangle that they hit."""
+    own = surfaces.interactions
     while len(rays.edge_point):
         face, distance = surfaces.find_first_hits(rays.origin, rays.direction)
         for rows, triangle in receiver.find_received(rays, face, distance):
@@ -336,7 +330,7 @@ def _follow_rays(
         passed = rays.through.sum(1)
         is_left = rays.faces.shape[1] - passed < depth, passed < MAX_SHEETS
         branches: list[_RaysPastEdges] = []
-        for passes, mask in ((False, powers.reflect), (True, powers.transmit)):
+        for passes, mask in ((False, own.reflect), (True, own.transmit)):
             rows = torch.nonzero(has_plane & mask[face.clamp_min(0)] & is_left[passes])[:, 0]
             part, hit = rays.select(rows), face[rows]
             normal = surfaces.planes.normal[surfaces.planes.face_plane[hit]]

@@ -202,7 +202,7 @@ class SingleScatteringTracer:
     ) -> None:
         self.depth, self.sampling, self.seed, self.pairing = sampling.depth, sampling, seed, pairing
         self.antennas = strip_derivatives(stage.tx), strip_derivatives(stage.rx)
-        self.powers = face_interactions(stage)
+        interactions = face_interactions(stage)
         # Discrete: `torch.func` would claim the intermediate tensors.
         with _DisableFuncTorch():
             rows = strip_derivatives(geometry.surfaces.diffuse) > 0
@@ -210,23 +210,21 @@ class SingleScatteringTracer:
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
             vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
-            occluders = vertices, stage.topology, ends, self.powers.transmit
+            occluders = vertices, stage.topology, ends, interactions
             self.surfaces = image_method.CandidateSurfaces(*occluders)
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:
         """Find candidate sequences from antennas of one end to rough points, by length from 1."""
         most = self.depth - 1
-        if most < 1 or not bool(self.powers.reflect.any()):
+        if most < 1 or not bool(self.surfaces.interactions.reflect.any()):
             return ()
         if rays is None:
-            found = enumerate_sequences(self.surfaces.planes, self.powers, most).steps
+            found = enumerate_sequences(self.surfaces, most).steps
             return tuple(steps for steps in found if len(steps))
         origins = self.antennas[end][torch.arange(rays) % len(self.antennas[end])]
         prefix = torch.zeros(rays, dtype=torch.int64)
-        columns = shoot_sequences_from_edges(
-            self.surfaces, self.powers, origins, prefix, most, self.seed + end
-        )
+        columns = shoot_sequences_from_edges(self.surfaces, origins, prefix, most, self.seed + end)
         return tuple(steps[:, 1:] for steps in columns if len(steps))
 
     def sum_pairs(
@@ -285,7 +283,7 @@ class SingleScatteringTracer:
             with _DisableFuncTorch():
                 receiver = shadow_boundaries.ReceivingTriangles(self.is_scattering)
                 depth = self.depth - 1
-                search = receiver, self.antennas[end], self.sequences[end], self.powers
+                search = receiver, self.antennas[end], self.sequences[end]
                 samples_by_length = shadow_boundaries.sample_illumination_boundaries(
                     self.surfaces, *search, depth=depth, samples=count, seed=self.seed + 2 + end
                 )

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from invertwin.channel.em.plane_waves import reflect_vectors
 from invertwin.channel.rays.ray_scene import MAX_SHEETS
-from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces, Planes
+from invertwin.channel.specular.image_method import DIRECT, CandidateSurfaces
 from invertwin.runtime.memory import require_at_most
 
 _LANES = 1 << 20
@@ -37,33 +37,18 @@ class CandidateSequences:
     missed_fraction: float | None
 
 
-@dataclass(frozen=True)
-class FaceInteractions:
-    """Possible interactions of triangles with rays.
-
-    Attributes:
-        reflect: mask of triangles that reflect.
-        transmit: mask of triangles that transmit.
-    """
-
-    reflect: Bool[Tensor, " f"]
-    transmit: Bool[Tensor, " f"]
-
-
-def enumerate_sequences(
-    planes: Planes, interactions: FaceInteractions, depth: int
-) -> CandidateSequences:
+def enumerate_sequences(surfaces: CandidateSurfaces, depth: int) -> CandidateSequences:
     """Enumerate all sequences of planes, no plane twice in a row.
 
     Args:
-        planes: planes of the scene.
-        interactions: interactions of the triangles.
+        surfaces: candidate surfaces of the scene.
         depth: maximum number of steps.
 
     Raises:
         InputError: more than a million sequences.
     """
-    options = planes.face_plane[interactions.reflect & (planes.face_plane >= 0)].unique()
+    planes, reflect = surfaces.planes, surfaces.interactions.reflect
+    options = planes.face_plane[reflect & (planes.face_plane >= 0)].unique()
     count = sum(len(options) ** step for step in range(1, depth + 1))
     what = f"sequences to test one by one (of {len(planes)} planes, depth {depth})"
     require_at_most(count, _MAX_SEQUENCES, what, "give a number of rays, or a smaller depth")
@@ -80,7 +65,6 @@ def enumerate_sequences(
 
 def find_sequences(
     surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
     origins: Float64[Tensor, "place 3"],
     depth: int,
     rays: int | None,
@@ -98,7 +82,6 @@ def find_sequences(
 
     Args:
         surfaces: candidate surfaces of the scene.
-        interactions: interactions of the triangles.
         origins: origins of the rays [m].
         depth: maximum number of steps.
         rays: number of rays from each origin; None enumerates all sequences.
@@ -109,9 +92,9 @@ def find_sequences(
     if not depth or rays == 0:
         return CandidateSequences((), None)
     if rays is None:
-        return enumerate_sequences(surfaces.planes, interactions, depth)
+        return enumerate_sequences(surfaces, depth)
     # A ray may split at every step.
-    chunk = max(1, _LANES // 2 ** (depth if bool(interactions.transmit.any()) else 0))
+    chunk = _count_lanes(surfaces, depth)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)
     for number, origin in enumerate(origins):
@@ -121,7 +104,7 @@ def find_sequences(
             index = torch.arange(start, min(start + chunk, rays))
             directions = _spiral_directions(index, rays) @ rotation.T
             started = (origin, directions), depth, DIRECT, torch.zeros_like(index)
-            row, row_count = _follow_rays(surfaces, interactions, *started)
+            row, row_count = _follow_rays(surfaces, *started)
             leaves, group = torch.cat([leaves, row]).unique(dim=0, return_inverse=True)
             both = torch.cat([count, row_count])
             count = torch.zeros(len(leaves), dtype=torch.int64).index_add(0, group, both)
@@ -131,7 +114,6 @@ def find_sequences(
 
 def shoot_sequences_from_edges(
     surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
     origins: Float64[Tensor, "ray 3"],
     edge: Int64[Tensor, " ray"],
     depth: int,
@@ -141,22 +123,25 @@ def shoot_sequences_from_edges(
 
     Args:
         surfaces: candidate surfaces of the scene.
-        interactions: interactions of the triangles.
         origins: origins of the rays, whose directions are random [m].
         edge: edge number of each origin, from zero without gaps.
         depth: maximum number of steps.
         seed: random seed of the directions.
     """
-    branches = 2 ** (depth if bool(interactions.transmit.any()) else 0)
     draws = np.random.default_rng(seed).standard_normal((len(origins), 3))
     directions = normalize(torch.from_numpy(draws), dim=1)
     prefix = torch.arange(int(edge.max()) + 1)[:, None]
     leaves = torch.zeros(0, depth + 1, dtype=torch.int64)
-    for some in torch.arange(len(origins)).split(max(1, _LANES // branches)):
+    for some in torch.arange(len(origins)).split(_count_lanes(surfaces, depth)):
         started = (origins[some], directions[some]), depth, prefix, edge[some]
-        rows, _ = _follow_rays(surfaces, interactions, *started)
+        rows, _ = _follow_rays(surfaces, *started)
         leaves = torch.cat([leaves, rows]).unique(dim=0)
     return _split_by_length(leaves, 2)
+
+
+def _count_lanes(surfaces: CandidateSurfaces, depth: int) -> int:
+    """Number of rays at once, of which sheets may split each at every step."""
+    return max(1, _LANES // 2 ** (depth if bool(surfaces.interactions.transmit.any()) else 0))
 
 
 def _split_by_length(leaves: Tensor, first: int) -> tuple[Tensor, ...]:
@@ -179,7 +164,6 @@ def _spiral_directions(index: Tensor, count: int) -> Float64[Tensor, "n 3"]:
 
 def _follow_rays(
     surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
     rays: tuple[Tensor, Tensor],
     depth: int,
     prefixes: Tensor,
@@ -194,6 +178,7 @@ def _follow_rays(
     origin = (position - surfaces.origin).to(torch.float32).expand(len(directions), 3)
     direction = directions.to(torch.float32)
     face_plane, normals = surfaces.planes.face_plane, surfaces.planes.normal.to(torch.float32)
+    masks = surfaces.interactions.reflect, surfaces.interactions.transmit
     # Sequences are a tree: each is the number of its parent and one more step.
     ended: list[tuple[Tensor, Tensor]] = []
     width = prefixes.shape[1] + depth
@@ -207,7 +192,7 @@ def _follow_rays(
             ended.append((prefixes, parent[~hit]))
             point = origin + distance.to(torch.float32)[:, None] * direction
             parent, face, point, direction = (x[hit] for x in (parent, face, point, direction))
-            reflects, transmits = interactions.reflect[face], interactions.transmit[face]
+            reflects, transmits = (mask[face] for mask in masks)
             ended.append((prefixes, parent[~(reflects | transmits)]))
             reflected = reflect_vectors(direction, normals[face_plane[face]])
             columns = parent, face_plane[face], point, reflected

@@ -27,11 +27,7 @@ from torch import Tensor
 from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.rows import Rows, concatenate_rows
 from invertwin.channel.specular import image_method
-from invertwin.channel.specular.candidates import (
-    FaceInteractions,
-    enumerate_sequences,
-    shoot_sequences_from_edges,
-)
+from invertwin.channel.specular.candidates import enumerate_sequences, shoot_sequences_from_edges
 from invertwin.channel.specular.corner_diffraction import face_weight
 from invertwin.channel.specular.edge_path_geometry import multiple_diffraction_points
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, match_rows
@@ -94,7 +90,6 @@ class DiffractionCandidates(Rows):
 
 def find_diffraction_candidates(
     wedge_scene: WedgeScene,
-    interactions: FaceInteractions,
     tx: Float64[Tensor, "tx 3"],
     rx: Float64[Tensor, "rx 3"],
     order: int,
@@ -106,7 +101,6 @@ def find_diffraction_candidates(
 
     Args:
         wedge_scene: scene with sharp edges.
-        interactions: interactions of the triangles.
         tx, rx: antenna positions [m].
         order: maximum number of edges on a path, 0 to 3.
         depth: maximum number of reflections on a path over one edge.
@@ -115,7 +109,7 @@ def find_diffraction_candidates(
     """
     if not order or not len(wedge_scene.detached_wedges.start):
         return
-    tables = _edge_sequences(wedge_scene, interactions, depth, rays, seed)
+    tables = _edge_sequences(wedge_scene, depth, rays, seed)
     sides = [
         [_find_visible_edges(wedge_scene, table, positions) for table in tables]
         for positions in (tx, rx)
@@ -129,7 +123,7 @@ def find_diffraction_candidates(
 
 
 def _edge_sequences(
-    wedge_scene: WedgeScene, interactions: FaceInteractions, depth: int, rays: int | None, seed: int
+    wedge_scene: WedgeScene, depth: int, rays: int | None, seed: int
 ) -> list[Int64[Tensor, "row column"]]:
     """Sequences that start at edges, by length: edge number, then steps."""
     surfaces, count = wedge_scene.surfaces, len(wedge_scene.detached_wedges.start)
@@ -138,7 +132,7 @@ def _edge_sequences(
     if not depth:
         return tables
     if rays is None:
-        for steps in enumerate_sequences(surfaces.planes, interactions, depth).steps:
+        for steps in enumerate_sequences(surfaces, depth).steps:
             edge = edges.repeat_interleave(len(steps))
             tables.append(torch.cat([edge[:, None], steps.repeat(count, 1)], 1))
     else:
@@ -147,7 +141,7 @@ def _edge_sequences(
         wedges = wedge_scene.detached_wedges.select(edge)
         points = wedges.start + torch.from_numpy(fraction)[:, None] * (wedges.end - wedges.start)
         points = wedge_scene.offset_points(edge, points)
-        tables += shoot_sequences_from_edges(surfaces, interactions, points, edge, depth, seed)
+        tables += shoot_sequences_from_edges(surfaces, points, edge, depth, seed)
     # Planes that contain the edge are its faces.
     own = [_lies_in_plane(wedge_scene, table[:, 0], table[:, 1]) for table in tables[1:]]
     return [tables[0], *(table[~mask] for table, mask in zip(tables[1:], own, strict=True))]

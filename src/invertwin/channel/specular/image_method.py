@@ -41,6 +41,19 @@ _RAY_SPREAD = 4.0  # margins between the rays that test a segment
 _EXACT_TOLERANCE = 1e-9  # of the scene's size: float64 points closer than this coincide
 
 
+@dataclass(frozen=True)
+class FaceInteractions:
+    """Possible interactions of triangles with rays.
+
+    Attributes:
+        reflect: mask of triangles that reflect.
+        transmit: mask of triangles that transmit.
+    """
+
+    reflect: Bool[Tensor, " f"]
+    transmit: Bool[Tensor, " f"]
+
+
 class CandidateSurfaces(Occluders):
     """Occluders of a scene and the planes of its triangles, candidates for reflection.
 
@@ -48,7 +61,7 @@ class CandidateSurfaces(Occluders):
         vertices: vertex positions in world axes, detached [m].
         topology: triangles of the vertices.
         antennas: antenna positions in world axes [m].
-        sheets: mask of triangles that transmit.
+        interactions: triangles that reflect, and those that transmit.
     """
 
     def __init__(
@@ -56,7 +69,7 @@ class CandidateSurfaces(Occluders):
         vertices: Float64[Tensor, "v 3"],
         topology: Topology,
         antennas: Float64[Tensor, "antenna 3"],
-        sheets: Bool[Tensor, " f"],
+        interactions: FaceInteractions,
     ) -> None:
         ends = torch.cat([vertices, antennas])
         super().__init__(vertices, topology, (ends.amax(0) + ends.amin(0)) / 2)
@@ -64,14 +77,14 @@ class CandidateSurfaces(Occluders):
         self.size = float((ends - self.origin).norm(dim=1).max())
         self.margin = RAY_EPSILON * self.size
         self.planes: Planes = find_planes(self.exact_vertices, topology.faces)
-        self.sheets = sheets
+        self.interactions = interactions
 
     @cached_property
     def device_planes(self) -> dict[str, Any]:
         """Planes as flat Dr.Jit arrays."""
         names = ("point", "normal", "axes", "low", "high")
         tables = {name: arrays.to_double(getattr(self.planes, name)) for name in names}
-        tables["is_sheet"] = arrays.to_index(self.sheets)
+        tables["is_sheet"] = arrays.to_index(self.interactions.transmit)
         return tables | {"of_face": arrays.to_index(self.planes.face_plane.clamp_min(0))}
 
     @cached_property
@@ -91,7 +104,9 @@ class CandidateSurfaces(Occluders):
             steps: planes of the reflections, in order.
         """
         point, normal = self.planes.point[steps], self.planes.normal[steps]
-        return image_positions(positions - self.origin, point, normal, torch.zeros_like(steps).bool())
+        return image_positions(
+            positions - self.origin, point, normal, torch.zeros_like(steps).bool()
+        )
 
 
 @dataclass(frozen=True)
@@ -535,7 +550,10 @@ def _cast_rays(
         torch.arange(len(unit)),
         segments.plane_before,
     )
-    width, gone = MAX_SHEETS if bool(surfaces.sheets.any()) else 0, torch.zeros_like(length)
+    width, gone = (
+        MAX_SHEETS if bool(surfaces.interactions.transmit.any()) else 0,
+        torch.zeros_like(length),
+    )
     passed = torch.full((len(unit), width), -1)
     for number in range(width + 1):
         origin, left = start[row] + gone[:, None] * unit[row], reach[row] - gone
@@ -544,7 +562,7 @@ def _cast_rays(
         expected = (plane == segments.plane[row]) & (gone > (length - excess)[row])
         ends = (face < 0) | expected
         found[row[ends]] = face[ends]
-        through = torch.nonzero(~ends & surfaces.sheets[face.clamp_min(0)])[:, 0]
+        through = torch.nonzero(~ends & surfaces.interactions.transmit[face.clamp_min(0)])[:, 0]
         if number == width or not len(through):
             break
         # After rounding a ray may meet the plane that it has passed.
@@ -589,7 +607,7 @@ def _test_exactly(
         point = start + fraction[:, None] * (end - start)
         inner = waves.barycentric_coordinates(corners[face[crossing]], point[crossing]).amin(1)
         crossing = crossing[inner >= -rim]
-        is_sheet = surfaces.sheets[face[crossing]]
+        is_sheet = surfaces.interactions.transmit[face[crossing]]
         valid[row[crossing[~is_sheet]]] = False
         crossing = crossing[is_sheet]
         number, sheet, place = _number_crossings(row[crossing], plane[crossing], fraction[crossing])

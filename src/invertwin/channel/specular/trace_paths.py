@@ -26,13 +26,18 @@ from invertwin.channel.rays.backend import tracing
 from invertwin.channel.rays.scene_tables import connect_surfaces, vertex_velocities
 from invertwin.channel.rays.topology import Topology
 from invertwin.channel.specular import image_method
-from invertwin.channel.specular.candidates import FaceInteractions, find_sequences
+from invertwin.channel.specular.candidates import find_sequences
 from invertwin.channel.specular.diffracted_paths import evaluate_diffracted_paths
 from invertwin.channel.specular.diffraction_candidates import (
     DiffractionCandidates,
     find_diffraction_candidates,
 )
-from invertwin.channel.specular.image_method import CandidateSurfaces, SpecularPaths, UnfoldedPaths
+from invertwin.channel.specular.image_method import (
+    CandidateSurfaces,
+    FaceInteractions,
+    SpecularPaths,
+    UnfoldedPaths,
+)
 from invertwin.channel.specular.ray_paths import REFLECTION, TRANSMISSION, RayPaths, join_ray_paths
 from invertwin.channel.specular.wedge_scene import WedgeScene
 from invertwin.checks import ArrayLike, checked_count, checked_tensor, strip_derivatives
@@ -141,12 +146,11 @@ def trace_paths(
         with _DisableFuncTorch():
             bare = path_scene.detach()
             antennas = torch.cat([bare.tx, bare.rx])
-            occluders = bare.vertices, bare.topology, antennas, interactions.transmit
-            surfaces = CandidateSurfaces(*occluders)
-            specular, missed = _find_specular(bare, surfaces, interactions, limit, rays, seed)
+            surfaces = CandidateSurfaces(bare.vertices, bare.topology, antennas, interactions)
+            specular, missed = _find_specular(bare, surfaces, limit, rays, seed)
             ends, options = (bare.tx, bare.rx), (edges, limit, rays, seed)
             wedges = _wedge_scene(bare, surfaces)
-            diffracted = list(find_diffraction_candidates(wedges, interactions, *ends, *options))
+            diffracted = list(find_diffraction_candidates(wedges, *ends, *options))
         paths = [part for group in specular for part in evaluate_paths(path_scene, group)]
         wedge_scene = _wedge_scene(path_scene, surfaces)
         for some in diffracted:
@@ -158,7 +162,6 @@ def trace_paths(
 def _find_specular(
     bare: PathScene,
     surfaces: CandidateSurfaces,
-    interactions: FaceInteractions,
     depth: int,
     rays: int | None,
     seed: int,
@@ -166,7 +169,7 @@ def _find_specular(
     """Find the specular paths, and the estimated fraction of missed directions."""
     swapped = len(bare.rx) < len(bare.tx)
     sources, targets = (bare.rx, bare.tx) if swapped else (bare.tx, bare.rx)
-    sequences = find_sequences(surfaces, interactions, sources, depth, rays, seed)
+    sequences = find_sequences(surfaces, sources, depth, rays, seed)
     found = image_method.find_paths_along(surfaces, sequences.steps, sources, targets)
     return [group.reverse() if swapped else group for group in found], sequences.missed_fraction
 
