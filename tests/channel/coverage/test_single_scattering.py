@@ -21,7 +21,7 @@ def strength(out: RayPaths, home: RayPaths, *_: Tensor) -> Tensor:
     """Power, and how many surfaces the ways meet."""
     ways = [way.coefficient.abs().square().sum((1, 2)) for way in (out, home)]
     power = ways[0] * ways[1]
-    return torch.stack([power, power * (out.depth + home.depth)], 1)
+    return torch.stack([power, power * (out.interaction_count + home.interaction_count)], 1)
 
 
 def summed(scene: Scene = SCENE, depth: int = 2, rays: int | None = None) -> Tensor:

@@ -60,7 +60,7 @@ def room(material: object = METAL, size: tuple[float, float, float] = (5.0, 4.0,
 @pytest.mark.parametrize("rays", [20_000, None])
 def test_two_rays_over_a_conducting_ground(rays):
     paths = trace(GROUND, *HEIGHTS, rays=rays)
-    assert paths.depth.tolist() == [0, 1]
+    assert paths.interaction_count.tolist() == [0, 1]
     free = WAVELENGTH / (4 * math.pi * math.hypot(50, 0.5))
     ratio = (response(paths) / free).abs().diagonal()
     # Two-ray formula |1 + R (d0/d1) exp(−jk(d1 − d0))| with R = +1 in the plane of incidence (V).
@@ -105,7 +105,7 @@ def test_corners_send_back_what_comes(plates, depth):
     scene = Scene({"corner": corner})
     tx, rx = [0.0, 0.1, 0.0], [0.05, -0.1, 0.1]
     paths = trace(scene, tx, rx, depth=depth)
-    last = paths.select(paths.depth == plates)
+    last = paths.select(paths.interaction_count == plates)
     faces = corner.vertices[corner.mesh.faces]
     normal = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     normal = normal / normal.norm(dim=1, keepdim=True)
@@ -234,7 +234,7 @@ def test_on_a_plate_the_field_is_that_of_a_conductor():
     )
     place = turn @ float64([0.4, -0.3, 0.0]) + float64([0.1, 0.2, 0.3])
     paths = trace(wall, [1.0, 0.5, 4.0], place, depth=2)
-    assert paths.depth.tolist() == [0, 1]
+    assert paths.interaction_count.tolist() == [0, 1]
     assert paths.delay.isfinite().all()
     total = torch.zeros(3, 2, dtype=torch.complex128)
     for row in range(2):
@@ -285,13 +285,13 @@ def test_the_seam_of_two_triangles_is_tight(turn):
     offset = seam - tx
     away = offset - 2 * (offset @ normal)[:, None] * normal
     mirrored, behind = trace(wall, tx, seam + away), trace(wall, tx, seam + offset)
-    assert torch.equal(mirrored.depth.view(200, 2).sort(1).values, torch.tensor([[0, 1]] * 200))
+    assert torch.equal(mirrored.interaction_count.view(200, 2).sort(1).values, torch.tensor([[0, 1]] * 200))
     assert len(behind) == 0
 
 
 def test_rough_surfaces_mirror_nothing():
     scene = Scene({"ground": Object(level_plate(200.0, 200.0), RoughDielectric(4.0))})
-    assert trace(scene, *HEIGHTS).depth.tolist() == [0]
+    assert trace(scene, *HEIGHTS).interaction_count.tolist() == [0]
     share = Dielectric(15.0, 0.01, scattering=0.6)
     whole = Dielectric(15.0, 0.01, scattering=0.0)
     both = [trace(GROUND.replace("ground", material=m), *HEIGHTS) for m in (share, whole)]
@@ -309,7 +309,7 @@ def test_a_slab_lets_through_what_it_should(angle):
         {"board": thing(level_plate(60.0, 60.0), turn=(0.0, angle, 0.0), material=slab())}
     )
     paths = trace(board, [0.1, 0.0, -1.5], [0.1, 0.0, 2.0], depth=2)
-    assert paths.depth.tolist() == [1]
+    assert paths.interaction_count.tolist() == [1]
     assert paths.kinds.tolist() == [[2]]
     cosine = float64([math.cos(angle)])
     t = slab_coefficients([slab().sheet(FREQUENCY)], cosine[:, None], FREQUENCY)
@@ -508,14 +508,14 @@ def test_a_scene_of_20_000_triangles():
     assert len(ball.mesh.faces) == 20_480
     met = paths.objects == paths.names.index("ball")
     assert int(met.any(1).sum()) >= 3
-    assert not bool((paths.select_link(0, 0).depth == 0).any())  # in its shadow
+    assert not bool((paths.select_link(0, 0).interaction_count == 0).any())  # in its shadow
     radius = (paths.vertices[met] - float64([0.0, 0.0, 2.0])).norm(dim=1)
     assert float((radius - 0.5).abs().max()) < 1e-3
     vertices = torch.cat([item.vertices for item in scene.objects.values()])
     room_faces = scene["room"].mesh.faces
     faces = torch.cat([room_faces, ball.mesh.faces + len(scene["room"].mesh.vertices)])
     for row in torch.nonzero(met.any(1))[:20, 0].tolist():
-        depth = int(paths.depth[row])
+        depth = int(paths.interaction_count[row])
         points = [tx, *paths.vertices[row, :depth], rx[paths.rx[row]]]
         pieces = [b - a for a, b in itertools.pairwise(points)]
         total = sum(float(piece.norm()) for piece in pieces)

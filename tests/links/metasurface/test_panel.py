@@ -80,7 +80,7 @@ def test_its_paths_have_the_signs_of_a_mirror():
     tilt = math.radians(20.0)
     tx, rx = ([abs(s) * math.cos(tilt), s * math.sin(tilt), 0.0] for s in (-1.0, 1.3))
     truth = trace_paths(mirror, tx, rx, FREQUENCY, depth=1, rays=None)
-    truth = truth.select(truth.depth == 1)
+    truth = truth.select(truth.interaction_count == 1)
     found = panel_paths(aside(), panel(int(1.2 / (WAVELENGTH / 2))), tx, rx, FREQUENCY)
     phases = [
         paths.coefficient

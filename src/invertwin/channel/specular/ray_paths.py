@@ -77,7 +77,7 @@ class RayPaths(Rows):
         return SPEED_OF_LIGHT * self.delay
 
     @property
-    def depth(self) -> Int64[Tensor, " path"]:
+    def interaction_count(self) -> Int64[Tensor, " path"]:
         """Number of interactions of each path; 0 = line of sight."""
         return (self.kinds > 0).sum(1)
 
@@ -117,7 +117,7 @@ class RayPaths(Rows):
 
     def reverse(self) -> "RayPaths":
         """Return the reciprocal paths, with transmitters and receivers exchanged."""
-        depth = self.depth[:, None]
+        depth = self.interaction_count[:, None]
         width = torch.arange(self.kinds.shape[1], device=depth.device)
         back = torch.where(width < depth, depth - 1 - width, width)
         rows = torch.arange(len(self), device=depth.device)[:, None]
