@@ -250,7 +250,7 @@ def _diffract_once(
             path = part.steps.flip(1), part.position, beside[rows]
             clear, *leg = image_method.find_unobstructed_paths(surfaces, *path)
             rows, legs = rows[clear], [(f[clear], t[clear]) for f, t in (*legs, leg)]
-        numbers = outbound.antenna[rows], inbound.antenna[rows], outbound.edge[rows, None]
+        numbers = outbound.antenna, inbound.antenna, outbound.edge[:, None]
         lengths = torch.stack([(faces >= 0).sum(1) for faces, _ in legs], 1)
         for own in lengths.unique(dim=0):
             chosen = torch.nonzero((lengths == own).all(1))[:, 0]
@@ -258,9 +258,9 @@ def _diffract_once(
                 PathLegs(faces[chosen, :length], transmitted[chosen, :length])
                 for (faces, transmitted), length in zip(legs, own.tolist(), strict=True)
             )
-            ends, none = (number[chosen] for number in numbers), torch.full((len(chosen), 0, 2), -1)
-            last = 0 < depth == count
-            yield DiffractionCandidates(*ends, before, after.reverse(), none, reflects=not last)
+            tx, rx, edge = (number[rows[chosen]] for number in numbers)
+            path = tx, rx, edge, before, after.reverse(), torch.full((len(chosen), 0, 2), -1)
+            yield DiffractionCandidates(*path, reflects=not 0 < depth == count)
 
 
 def _match_edges(

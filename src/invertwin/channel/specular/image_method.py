@@ -84,8 +84,8 @@ class CandidateSurfaces(Occluders):
         """Planes as flat Dr.Jit arrays."""
         names = ("point", "normal", "axes", "low", "high")
         tables = {name: arrays.to_double(getattr(self.planes, name)) for name in names}
-        tables["is_sheet"] = arrays.to_index(self.interactions.transmit)
-        return tables | {"of_face": arrays.to_index(self.planes.face_plane.clamp_min(0))}
+        sheets, planes = self.interactions.transmit, self.planes.face_plane.clamp_min(0)
+        return tables | {"is_sheet": arrays.to_index(sheets), "of_face": arrays.to_index(planes)}
 
     @cached_property
     def device_rim_widths(self) -> Any:
@@ -498,7 +498,8 @@ def _test_segments(
     second = waves.cross(unit, first)
     votes = torch.zeros(len(unit), dtype=torch.int64)
     end_plane = segments.plane.maximum(segments.target_plane)
-    tables: list[Tensor] = []
+    faces = passed = previous = votes
+    agree = torch.ones_like(votes, dtype=torch.bool)
     for number in range(4):
         spread = _RAY_SPREAD * surfaces.margin * (number < 3)  # the last ray is not shifted
         offset = spread * (math.cos(2.1 * number) * first + math.sin(2.1 * number) * second)
@@ -506,8 +507,9 @@ def _test_segments(
         end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
         faces, passed = _cast_rays(surfaces, start, end, segments)
         votes += torch.where(segments.plane >= 0, faces >= 0, faces == -1)
-        tables.append(surfaces.planes.face_plane[passed].where(passed >= 0, -1))
-    agree = (torch.stack(tables) == tables[0]).all(2).all(0)
+        planes = surfaces.planes.face_plane[passed].where(passed >= 0, -1)
+        agree &= (planes == (previous if number else planes)).all(1)
+        previous = planes
     undecided = torch.nonzero((votes > 0) & ~((votes == 4) & agree))[:, 0]
     valid = votes == 4
     if len(undecided):

@@ -92,7 +92,7 @@ class Placement(Section):
         spread_start_deg: half widths of the beam, across and up, where they start
         yaw_limit_deg: largest turn away from the wall's normal
         spread_limit_deg: largest half width of the beam
-        depth: most surfaces that a path without the panel meets
+        depth: most reflections of a path without the panel
         edges: most edges that a path without the panel goes round
         edge_width: m, added to the width of shadows; it falls to none over reconstruct.annealing
         softness: dB, width of the quantile; it falls to a tenth alike
