@@ -242,9 +242,7 @@ class _Conversion:
     def apply(self) -> dict[str, Any]:
         """The run file of today, as tables."""
         found = copy.deepcopy(self.raw)
-        for path, new in self._new_values():
-            _holder(found, path)[path[-1]] = new
-        for path, new in self.added.items():
+        for path, new in (*self._new_values(), *self.added.items()):
             _holder(found, path)[path[-1]] = new
         for path in self.removed:
             del _holder(found, path)[path[-1]]
@@ -360,7 +358,9 @@ class _Conversion:
         self._walk(path, self.top["properties"].get(name, {}), value, own, outer)
         # What the section states itself is changed there.
         for found in [at for at in self.changes if at not in known]:
-            if _value_at(self.raw, found, missing=None) is None:
+            try:
+                _value_at(self.raw, found)
+            except (KeyError, IndexError):
                 del self.changes[found]
 
     def _convert_leaf(
@@ -666,18 +666,13 @@ def _old_look_at(place: Sequence[float], target: Sequence[float]) -> np.ndarray:
 
 
 def _holder(tables: Any, path: KeyPath) -> Any:
-    for step in path[:-1]:
+    return _value_at(tables, path[:-1])
+
+
+def _value_at(tables: Any, path: KeyPath) -> Any:
+    for step in path:
         tables = tables[step]
     return tables
-
-
-def _value_at(tables: Any, path: KeyPath, **otherwise: Any) -> Any:
-    try:
-        return _holder(tables, path)[path[-1]]
-    except (KeyError, IndexError):
-        if "missing" in otherwise:
-            return otherwise["missing"]
-        raise
 
 
 def _replace_value(holder: Any, key: str | int, new: Any) -> None:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from invertwin import checks
 from invertwin.errors import InputError
-from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.parameters import RigidMotion
 from invertwin.scene.pose import rotate_about_mean
@@ -47,10 +46,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         do = "give x, y, z, or a row of them for each frame"
-        given = torch.as_tensor(self.positions, dtype=torch.float64)
-        shape = (3,) if given.ndim == 1 else (None, 3)
-        what = "positions of a camera"
-        places = checks.checked_tensor(given, shape, what, do, MAX_LENGTH).reshape(-1, 3)
+        places = checks.checked_rows(self.positions, "positions of a camera", do)
         axes = torch.as_tensor(self.rotations, dtype=torch.float64)
         axes = axes.expand(len(places), 3, 3) if axes.ndim == 2 else axes
         do = "give the camera's axes as columns, once or for each frame"
@@ -88,8 +84,7 @@ class Camera:
             InputError: Wrong numbers, or a camera that looks along ``up``.
         """
         do = "give x, y, z"
-        given = torch.as_tensor(positions, dtype=torch.float64)
-        places = checks.checked_tensor(given.reshape(-1, 3), (None, 3), "positions [m]", do)
+        places = checks.checked_rows(positions, "positions [m]", do)
         aim = checks.checked_tensor(target, (3,), "target of a camera [m]", do) - places
         above = checks.checked_tensor(up, (3,), "up of a camera", do).expand_as(aim)
         right = torch.linalg.cross(aim, above)

@@ -8,7 +8,6 @@ the values on both of its sides.
 Source: derivations §3, on the image plane instead of a surface.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -153,11 +152,8 @@ class _ImageRenderer:
             camera: camera with derivatives, or without.
         """
         face = self.sight.find_first_faces(self.fixed.directions(positions, self.number))
-        rows = torch.nonzero(face >= 0)[:, 0]
-        directions = camera.directions(positions[rows], self.number)
-        depth = self.sight.plane_distances(face[rows], directions)
-        none = torch.full((len(face),), math.inf, dtype=torch.float64)
-        return self.ray_value(self.sight, face, none.index_put((rows,), depth))
+        depth = self.sight.plane_distances(face, camera.directions(positions, self.number))
+        return self.ray_value(self.sight, face, depth)
 
     def _outline_derivative(self, curves: DiscontinuityCurves) -> Float64[Tensor, " pixel"]:
         """Return the contribution of outlines to derivatives; zero in value."""

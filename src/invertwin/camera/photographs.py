@@ -84,10 +84,8 @@ def _render_labels(scene: Scene, camera: Camera, number: int) -> tuple[Tensor, T
         middles = torch.stack([column, row], 2).reshape(-1, 2).double() + 0.5
         directions = camera.directions(middles, number)
         face = sight.find_first_faces(directions)
-        found = face >= 0
-        depth = torch.full((len(face),), torch.inf, dtype=torch.float64)
-        depth[found] = sight.plane_distances(face[found], directions[found])
-        label = torch.where(found, sight.face_object[face.clamp_min(0)], -1).long()
+        depth = sight.plane_distances(face, directions)
+        label = torch.where(face >= 0, sight.face_object[face.clamp_min(0)], -1).long()
     return label.reshape(row.shape), depth.reshape(row.shape)
 
 

@@ -403,10 +403,7 @@ def _count_views(radar: Radar, positions: Tensor, scene: Scene | None) -> Tensor
         if scene is not None:
             sight = ViewpointScene(scene, place)
             face = sight.find_first_faces(way)
-            hit = face >= 0
-            length = torch.full((len(way),), math.inf, dtype=torch.float64)
-            length[hit] = sight.plane_distances(face[hit], normalize(way, dim=1)[hit]).detach()
-            seen &= length > way.norm(dim=1)
+            seen &= sight.plane_distances(face, normalize(way, dim=1)) > way.norm(dim=1)
         total += seen
     return total
 

@@ -108,8 +108,7 @@ class ShapeSearch:
         def compute() -> Tensor:
             coarse = self.fitted_frames.coarse_maps
             predicted = self.fitted_frames.predict_coarse(shapes) + coarse.loss.level[:, None, None]
-            response, degrees = self.image_grid.response, coarse.loss.degrees
-            return reconstruct_reflectivity(response, coarse.power, predicted, degrees=degrees)
+            return reconstruct_reflectivity(self.image_grid.response, coarse.power, predicted)
 
         return self.fitted_frames.memory.recall("image", shapes, compute)
 

@@ -23,11 +23,7 @@ def delay_spread(
         tx: Antenna mount of the transmitters.
         rx: Antenna mount of the receivers.
     """
-    power = path_powers(paths, tx, rx)
-    total = _sum_links(paths, power)
-    mean = _sum_links(paths, power * paths.delay) / _nonzero(total)
-    offset = paths.delay - mean[paths.rx, paths.tx]
-    return safe_sqrt(_sum_links(paths, power * offset**2) / _nonzero(total))
+    return _spread(paths, paths.delay[:, None], tx, rx)
 
 
 def angle_spread(
@@ -54,13 +50,16 @@ def angle_spread(
     selectivity in the radio channel", IEEE Trans. Information Theory 46, 2000.
     """
     check_choice(end, ("departure", "arrival"), "end as")
+    return _spread(paths, getattr(paths, end), tx, rx)
+
+
+def _spread(paths: RayPaths, values: Tensor, tx: AntennaMount, rx: AntennaMount) -> Tensor:
+    """Root mean square distance of vectors from their mean, which does not cancel as 1 − |u|²."""
     power = path_powers(paths, tx, rx)
     total = _nonzero(_sum_links(paths, power))
-    direction: Tensor = getattr(paths, end)
-    mean = torch.stack([_sum_links(paths, power * x) for x in direction.unbind(1)], -1)
+    mean = torch.stack([_sum_links(paths, power * x) for x in values.unbind(1)], -1)
     mean = mean / total[..., None]
-    # The mean square distance from the mean, which does not cancel as 1 − |u|² does.
-    offset = (direction - mean[paths.rx, paths.tx]).square().sum(1)
+    offset = (values - mean[paths.rx, paths.tx]).square().sum(1)
     return safe_sqrt(_sum_links(paths, power * offset) / total)
 
 

@@ -489,12 +489,12 @@ def position_coordinates(name: str, parameter: str, mask: Tensor) -> list[Coordi
 
     Args:
         name: name of the object or antenna at the position.
-        parameter: name of the parameter [3] that moves it.
+        parameter: name of the parameter [2 or 3] that moves it.
         mask: 1 for each free axis.
     """
     return [
         Coordinate(f"{name}.{axis}", "m", {parameter: along}, _POSITION_SCALE)
-        for axis, along, free in zip("xyz", torch.diag(mask), mask, strict=True)
+        for axis, along, free in zip("xyz", torch.diag(mask), mask, strict=False)
         if free
     ]
 

@@ -88,12 +88,14 @@ class ViewpointScene:
         """Compute distances to the planes of triangles, in lengths of the directions; attached.
 
         Args:
-            face: triangle indices [n].
+            face: triangle indices [n]; −1 is infinitely far.
             directions: directions in the world [n, 3].
         """
-        a, b, c = self._vertices[self._topology.faces[face]].unbind(1)
+        hit = torch.nonzero(face >= 0)[:, 0]
+        a, b, c = self._vertices[self._topology.faces[face[hit]]].unbind(1)
         normal = cross(b - a, c - a)
-        return dot(a - self._viewpoint, normal) / dot(directions, normal)
+        distance = dot(a - self._viewpoint, normal) / dot(directions[hit], normal)
+        return distance.new_full((len(face),), torch.inf).index_put((hit,), distance)
 
     def find_silhouettes(self) -> DiscontinuityCurves:
         """Edges where surfaces end, or turn away from the place."""

@@ -48,8 +48,6 @@ def detect_moving_targets(
     beat = recording.beat - recording.beat.mean(1, keepdim=True)
     radar, chirps = recording.radar(), recording.chirps
     points = detect_points(beat, radar, grid, chirps, frame)
-    if points is None or not len(points.power):
-        return []
     cell = 2 * doppler.velocity_span(radar, chirps) / chirps.count
     origin, own_velocity = radar.positions[frame].detach(), platform_velocities(recording)[frame]
     aways = torch.nn.functional.normalize(points.position.detach().double() - origin, dim=1)
@@ -160,9 +158,8 @@ def coherent_image(
         Power with the spreading loss removed, and the coherent fraction of the total power: 1 for a
             single point, about 1 over the number of frames for noise.
     """
-    count = capture.radar().frame_count
     parts = [
-        (backproject(capture, part), _single_frame_power(capture, part, count))
+        (backproject(capture, part), _single_frame_power(capture, part))
         for part in positions.split(_POINTS_PER_CHUNK)
     ]
     field, power = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -204,11 +201,11 @@ def find_image_peak(
     return (points[peak], float(image[peak])) if image[peak] > 0 else None
 
 
-def _single_frame_power(capture: Capture, positions: Tensor, count: int) -> Tensor:
+def _single_frame_power(capture: Capture, positions: Tensor) -> Tensor:
     total = torch.zeros(len(positions), dtype=torch.float64)
-    for frame in range(count):
+    for frame in range(capture.frame_count):
         total += backproject(capture.frames([frame]), positions).abs().square().double()
-    return total / count
+    return total / capture.frame_count
 
 
 def locate_coherent_points(

@@ -21,6 +21,7 @@ _MIN_RELATIVE_RESPONSE = 1e-3  # relative to the peak of a response: smaller ent
 _MIN_RESPONSE = 1e-30  # smaller responses are invisible points [1/m²]
 _TABLE_STEPS_PER_BIN = 32  # entries of a kernel's table per bin
 _TABLE_MIDDLE = 16 * _TABLE_STEPS_PER_BIN  # entry of lag 0
+_STEPS = 40  # multiplicative updates
 _MAX_MATRIX_ENTRIES = 8e7  # entries of the matrix, 8 bytes each
 _Maps = Float64[Tensor, "frame range u v"]  # power of every frame
 
@@ -147,9 +148,6 @@ def reconstruct_reflectivity(
     response: ImageResponse,
     power: _Maps,
     known_power: _Maps,
-    *,
-    steps: int = 40,
-    degrees: float = TAIL_DEGREES,
 ) -> Float64[Tensor, " point"]:
     """Compute the maximum-likelihood reflectivity by multiplicative updates.
 
@@ -165,8 +163,6 @@ def reconstruct_reflectivity(
         response: response of the points.
         power: measured maps.
         known_power: power of known objects and of the background.
-        steps: number of steps.
-        degrees: degrees of freedom of the speckle.
 
     Returns:
         Radar cross-section of every point [m²].
@@ -179,10 +175,10 @@ def reconstruct_reflectivity(
     excess = np.maximum(data - known, 0.0)
     strength = np.full(len(total), excess.sum() / total.sum(), dtype=np.float32)
     strength[total <= 0] = 0.0
-    for _ in track(range(steps), "sharp image"):
+    for _ in track(range(_STEPS), "sharp image"):
         mean = matrix @ strength + known
         ratio = data / mean
-        brighter = back @ (ratio * speckle_weight(ratio, degrees) / mean)
+        brighter = back @ (ratio * speckle_weight(ratio, TAIL_DEGREES) / mean)
         strength *= np.sqrt(brighter / np.maximum(back @ (1 / mean), 1e-30))
     return torch.from_numpy(strength.astype(np.float64))
 

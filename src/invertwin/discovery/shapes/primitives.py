@@ -14,7 +14,7 @@ from invertwin import scene as scenes
 from invertwin.checks import check_fields
 from invertwin.constants import read_table
 from invertwin.limits import Positive
-from invertwin.scene.parameters import Coordinate
+from invertwin.scene.parameters import Coordinate, position_coordinates
 from invertwin.scene.people.gait import hanging_arm_rotation
 from invertwin.scene.shapes import box, cylinder, sphere
 
@@ -175,11 +175,7 @@ class UnknownShape(nn.Module):
 
     def position_coordinates(self) -> list[Coordinate]:
         """Return the two coordinates of its position."""
-        along = torch.eye(2, dtype=torch.float64)
-        return [
-            Coordinate(f"{self.object}.{axis}", "m", {"place": row}, 0.1)
-            for axis, row in zip("xy", along, strict=True)
-        ]
+        return position_coordinates(self.object, "place", torch.ones(2, dtype=torch.float64))
 
     def brightness_coordinate(self) -> Coordinate:
         """Return the coordinate of its brightness."""

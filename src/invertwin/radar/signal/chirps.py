@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invertwin.channel import Paths
 from invertwin.checks import check_fields
@@ -17,7 +18,6 @@ from invertwin.radar.radar import Radar, require_sampled_waveform
 from invertwin.radar.signal import nufft
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.radar.waveform import FMCW, SampledWaveform, SteppedFrequency
-from invertwin.runtime.concurrency import tracer_lock
 from invertwin.runtime.progress import track
 
 # Maximum interpolation error of a path's phase factor between the instants of a ramp.
@@ -176,8 +176,7 @@ def simulate_chirp_train(
 
 
 def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
-    """Compute the derivative of the paths' range R = L/2 with respect to time, in forward mode
-    [m/s].
+    """Compute the derivative of the paths' range R = L/2 with respect to time [m/s].
 
     It is positive for receding points; the Doppler frequency is 2/λ times it.
 
@@ -190,14 +189,8 @@ def range_rate(paths: Paths, radar: Radar) -> Float64[Tensor, " path"]:
     link, velocity = radar.link(), paths.velocity
     first_velocity = velocity if paths.first_velocity is None else paths.first_velocity
     tx, rx = (centre.to(paths.first.device)[paths.frame] for centre in (link.tx, link.rx))
-
-    def half_length(time: Tensor) -> Tensor:
-        first, last = paths.first + first_velocity * time, paths.last + velocity * time
-        return 0.5 * ((first - tx).norm(dim=1) + (last - rx).norm(dim=1))
-
-    now = torch.zeros((), dtype=torch.float64, device=velocity.device)
-    with tracer_lock:
-        return torch.func.jvp(half_length, (now,), (torch.ones_like(now),))[1]
+    away_tx, away_rx = normalize(paths.first - tx, dim=1), normalize(paths.last - rx, dim=1)
+    return 0.5 * (first_velocity * away_tx + velocity * away_rx).sum(1)
 
 
 def sample_interval(waveform: SampledWaveform) -> float:

@@ -1,6 +1,7 @@
 """Smooth surrogate of range-Doppler-angle processing."""
 
 import math
+from dataclasses import replace
 from itertools import combinations
 
 import torch
@@ -12,7 +13,7 @@ from invertwin.checks import check_shape
 from invertwin.radar.aperture import aperture
 from invertwin.radar.processing.doppler import velocity_span
 from invertwin.radar.radar import Radar
-from invertwin.radar.signal.chirps import Chirps
+from invertwin.radar.signal.chirps import Chirps, range_rate
 from invertwin.radar.surrogate.point_spread import interpolate_response
 from invertwin.radar.waveform import FMCW, SteppedFrequency, Waveform, unit_window
 
@@ -55,7 +56,7 @@ def range_doppler_power(
     """
     do = "evaluate them at the paths' points"
     check_shape(velocities, paths.first.shape, "velocities, one per path,", do)
-    direction, own_rates = _directions_and_rates(paths, velocities, radar)
+    own_rates = range_rate(replace(paths, velocity=velocities), radar)
     off = own_rates - rates[:, None]
     doppler = _doppler_response(off / velocity_span(radar, chirps), chirps, window)
     coupled = own_rates * _range_doppler_coupling(radar.waveform)
@@ -65,7 +66,7 @@ def range_doppler_power(
         radar.waveform.range_resolution,
         lambda places: radar.waveform.range_response(places, radar.window),
     )
-    steered = _beam_weights(direction, radar, grid)
+    steered = _beam_weights(_local_directions(paths, radar), radar, grid)
     starts = 4 * math.pi / radar.waveform.wavelength * chirps.times(len(steered))[0]
     frames = []
     for index in range(radar.frame_count):
@@ -80,16 +81,12 @@ def range_doppler_power(
     return torch.stack(frames)
 
 
-def _directions_and_rates(paths: Paths, velocities: Tensor, radar: Radar) -> tuple[Tensor, Tensor]:
-    """Return unit directions in the radar frame, and range rates [m/s]."""
+def _local_directions(paths: Paths, radar: Radar) -> Tensor:
+    """Return unit directions in the radar frame."""
     link = radar.link()
-    away_tx = torch.nn.functional.normalize(paths.first - link.tx[paths.frame], dim=1)
-    away_rx = torch.nn.functional.normalize(paths.last - link.rx[paths.frame], dim=1)
     center = 0.5 * (link.tx + link.rx)[paths.frame]
     direction = torch.nn.functional.normalize(paths.last - center, dim=1)
-    local = torch.einsum("pji,pj->pi", link.rotations[paths.frame], direction)
-    first = velocities if paths.first_velocity is None else paths.first_velocity
-    return local, 0.5 * (first * away_tx + velocities * away_rx).sum(1)
+    return torch.einsum("pji,pj->pi", link.rotations[paths.frame], direction)
 
 
 def _range_doppler_coupling(waveform: Waveform) -> float:
