@@ -154,7 +154,7 @@ class Estimator:
                 chunks=lambda size: iter([dr.arange(mi.UInt32, size)] if size else []),
             )
             walk = RandomWalk(self.inputs, seed)
-            for paths in boundary.trace_boundary_paths(attached, walk, points):
+            for paths in points.trace_paths(attached, walk):
                 total = paths.sum_weighted(lambda _, exists: dr.select(exists, mi.Float(1.0), 0.0))
                 dr.backward_from(paths.speed * total)
         gradient = from_points(dr.grad(vertices)).numpy()

@@ -30,9 +30,9 @@ def gradients(
         number, antennas = mi.UInt32(0), replay._locate_antennas(inputs, records.frame)
         near = replay._VertexNeighbours.read(inputs, records, number, records.depth)
         vertex = replay._evaluate_vertex(inputs, records, antennas, number, near)
-        path, arriving = vertex.to_contribution(), vertex.incident_factor
+        path, arriving = vertex.path, vertex.incident_factor
         power = dr.select(vertex.is_visible, path.power * (arriving / dr.detach(arriving)), 0)
-        length = 0.5 * (vertex.optical_length + vertex.connection.distance)
+        length = 0.5 * (vertex.optical_length + vertex.distance)
         out += _weighted(grid, weights, replace(path, power=power, range=length))
     for paths in trace.trace_boundary(inputs):
 

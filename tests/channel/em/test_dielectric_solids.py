@@ -212,7 +212,7 @@ def test_power_that_enters_a_clear_block_leaves_it(angle):
     facets = build_facets(item.vertices, topology)
     incident = float64([[math.sin(angle), 0.0, -math.cos(angle)]])
     k = 2 * math.pi / 0.01
-    skins = signature._smooth_interfaces(scene, topology, 30e9)
+    skins = signature._smooth_interfaces(scene, 30e9)
     entered = group_solids(
         [skins], [k], facets.corners, facets.solid, topology.face_object, ["block"]
     )

@@ -285,7 +285,9 @@ def test_the_seam_of_two_triangles_is_tight(turn):
     offset = seam - tx
     away = offset - 2 * (offset @ normal)[:, None] * normal
     mirrored, behind = trace(wall, tx, seam + away), trace(wall, tx, seam + offset)
-    assert torch.equal(mirrored.interaction_count.view(200, 2).sort(1).values, torch.tensor([[0, 1]] * 200))
+    assert torch.equal(
+        mirrored.interaction_count.view(200, 2).sort(1).values, torch.tensor([[0, 1]] * 200)
+    )
     assert len(behind) == 0
 
 

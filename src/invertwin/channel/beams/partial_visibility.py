@@ -131,14 +131,11 @@ def _find_silhouette_edges(
         start, end = vertices[topology.edges].unbind(1)
         observer = observers[rows, None]
         plane = cross(start - observer, (end - start).expand(len(rows), -1, -1))
-        sides = []
-        for apex in topology.edge_apexes.T:
-            offset = vertices[apex.clamp_min(0)] - start
-            side = dot(plane, offset.expand_as(plane))
-            coplanar = side.abs() <= _COPLANAR_TOLERANCE * plane.norm(dim=-1) * offset.norm(dim=-1)
-            side = torch.where(coplanar | (apex < 0), 0.0, side.sign())
-            sides.append(side)
-        table = torch.stack(sides)
+        apexes = topology.edge_apexes.T[:, None]
+        offset = vertices[apexes.clamp_min(0)] - start
+        side = (plane * offset).sum(-1)
+        coplanar = side.abs() <= _COPLANAR_TOLERANCE * plane.norm(dim=-1) * offset.norm(dim=-1)
+        table = torch.where(coplanar | (apexes < 0), 0.0, side.sign())
         silhouette = (table.sum(0).abs() == table.abs().sum(0)) & (table.abs().sum(0) > 0)
         # Part of the edge between the panel's plane and the observer.
         height = (observer - cells.center) @ normal
@@ -272,7 +269,6 @@ def _match_cells_to_edges(
     """
     cells, count = projection_args[2], is_visible.shape[1]
     cell_size = torch.tensor(cells.size, dtype=torch.float64)
-    best = torch.full_like(is_visible, torch.inf, dtype=torch.float64).ravel()
     parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for rows in torch.arange(len(edges.observer)).split(max(1, _PAIRS_AT_ONCE // count)):
         chunk = edges.select(rows)
@@ -283,13 +279,10 @@ def _match_cells_to_edges(
         agrees = (distance >= 0) == is_visible.ravel()[pixel]
         near = torch.nonzero(agrees & (distance.abs() < reach))[:, 0]
         parts.append((rows[near // count], near % count, pixel[near], distance[near].abs()))
-    if not parts:
-        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
-    row, cell, pixel, distance_abs = (torch.cat(column) for column in zip(*parts, strict=True))
-    best = best.scatter_reduce(0, pixel, distance_abs, "amin")
-    nearest = torch.nonzero(distance_abs <= best[pixel])[:, 0]
-    # Of equally near lines, the first.
-    order = nearest[pixel[nearest].argsort(stable=True)]
+    row, cell, pixel, away = (torch.cat(column) for column in zip(*parts, strict=True))
+    # Of each cell the nearest line; of equally near ones, the first.
+    order = away.argsort(stable=True)
+    order = order[pixel[order].argsort(stable=True)]
     first = torch.ones(len(order), dtype=torch.bool)
     first[1:] = pixel[order][1:] != pixel[order][:-1]
     return row[order[first]], cell[order[first]]

@@ -405,14 +405,11 @@ class SingleScatteringTracer:
         Returns:
             The pairs, and the number of the point of each.
         """
-        outbound, inbound = (
-            join_ray_paths([part for some in legs for part in evaluate_paths(material, some)])
-            for material, legs in zip(
-                [_replace_antennas(stage, end, point.position) for end in (stage.tx, stage.rx)],
-                path_legs,
-                strict=True,
-            )
-        )
+        found = []
+        for end, legs in zip((stage.tx, stage.rx), path_legs, strict=True):
+            local = _replace_antennas(stage, end, point.position)
+            found.append(join_ray_paths([p for some in legs for p in evaluate_paths(local, some)]))
+        outbound, inbound = found
         first, second = match_rows(outbound.rx, inbound.rx, len(area))
         ends, normal = ((outbound, first), (inbound, second)), strip_derivatives(point.normal)
         side = [dot(normal[leg.rx], strip_derivatives(leg.arrival))[n] > 0 for leg, n in ends]

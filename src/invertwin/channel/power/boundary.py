@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -133,47 +132,29 @@ class BoundarySamples:
         for drawn in itertools.chain(*self._prefetched):
             drawn.launch()
 
-    def iterate_points(self) -> Iterator[tuple[_PathBuilder, Any]]:
-        """Iterate over chunks of points, each with the function that builds its paths.
+    def trace_paths(self, inputs: Inputs, walker: RandomWalk) -> Iterator[BoundaryPaths]:
+        """Trace the boundary paths through the points.
 
-        The first chunk of each family is compressed now.
+        The first points of each family are compressed now, so that their paths are prepared while
+        another kernel runs.
+
+        Args:
+            inputs: attached inputs.
+            walker: random walk that extends the paths.
         """
         first = [[drawn.compress() for drawn in family] for family in self._prefetched]
         self._prefetched = [[] for _ in first]
 
-        def points() -> Iterator[tuple[_PathBuilder, Any]]:
-            for (sampler, builder), ready in zip(self._families, first, strict=True):
+        def paths() -> Iterator[BoundaryPaths]:
+            for (sampler, build), ready in zip(self._families, first, strict=True):
                 later = itertools.islice(self._chunks(sampler.size), len(ready), None)
-                while ready:
-                    yield builder, ready.pop()
-                for index in later:
-                    yield builder, sampler.draw(index).compress()
+                held = (ready.pop() for _ in range(len(ready)))
+                for found in itertools.chain(held, (sampler.draw(k).compress() for k in later)):
+                    if found.size:
+                        parts = build(inputs, walker, found, self.depth)
+                        yield from itertools.starmap(BoundaryPaths, parts)
 
-        return points()
-
-
-def trace_boundary_paths(
-    inputs: Inputs, walker: RandomWalk, samples: BoundarySamples
-) -> Iterator[BoundaryPaths]:
-    """Trace the boundary paths through sampled points.
-
-    The first points are compressed now, so that their paths are prepared while another kernel
-    runs.
-
-    Args:
-        inputs: attached inputs.
-        walker: random walk that extends the paths.
-        samples: points on edges and intersection curves.
-    """
-    points = samples.iterate_points()
-
-    def segments() -> Iterator[BoundaryPaths]:
-        for build, found in points:
-            if found.size:
-                parts = build(inputs, walker, found, samples.depth)
-                yield from itertools.starmap(BoundaryPaths, parts)
-
-    return segments()
+        return paths()
 
 
 def _antenna_silhouette_paths(

@@ -35,21 +35,17 @@ Gradient = TypeVar("Gradient")
 class _VertexFactors:
     """Factors of a path at one vertex.
 
-    The masks, the throughput and the length are detached; the factors are attached.
+    The masks are detached; the factors are attached.
 
     Attributes:
         active: mask of paths with this vertex.
         has_next: mask of paths with a further vertex.
         is_visible: mask of vertices that are connected to the receiver.
-        throughput: product of all factors up to the vertex.
-        length: optical length up to the vertex [m].
-        frame: radar poses.
+        path: contribution of the path that ends here.
         incident_factor: gain at the start, 1/R² of the segment before the vertex, Jacobian.
         optical_length: optical length of that segment [m].
-        connection: segment from the vertex to the receiver.
-        polarisation_factor: polarisation factor of the path that ends here.
+        distance: length of the connection to the receiver [m].
         scattering_factor: scattering towards the next vertex.
-        transmission: transmission of the connection.
         shares_segment: mask of connections with the same transmission as the segment before.
         endpoints: functions that locate the previous vertex, this one, and the receiver.
     """
@@ -57,25 +53,13 @@ class _VertexFactors:
     active: mit.Bool
     has_next: mit.Bool
     is_visible: mit.Bool
-    throughput: mit.Float
-    length: mit.Float
-    frame: mit.UInt32
+    path: PathContribution
     incident_factor: mit.Float
     optical_length: mit.Float
-    connection: integrand.AntennaConnection
-    polarisation_factor: mit.Float
+    distance: mit.Float
     scattering_factor: mit.Float
-    transmission: sheets.SegmentTransmission
     shares_segment: mit.Bool
     endpoints: tuple[Position, Position, Position]
-
-    def to_contribution(self) -> PathContribution:
-        """Contribution of the path that ends at the vertex."""
-        end, passed = self.connection, self.transmission
-        power = self.throughput * end.factor * passed.transmittance * self.polarisation_factor
-        length = 0.5 * (self.length + end.distance + passed.extra_length)
-        u, v = end.direction.y, end.direction.z
-        return PathContribution(self.frame, power, length, u, v)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -204,8 +188,12 @@ def _evaluate_vertex(
         previous = neighbours.previous
         return previous and integrand.compute_interaction(inputs, previous, inner)
 
+    power = vertex.throughput * connection.factor * passed.transmittance
+    power = power * inputs.polarisation_factor(number + 1)
+    length = records.length_at(number, active) + connection.distance + passed.extra_length
+    u, v = connection.direction.y, connection.direction.z
     return _VertexFactors(
-        transmission=passed,
+        path=PathContribution(frame, power, 0.5 * length, u, v),  # type: ignore[arg-type]
         shares_segment=twice,
         endpoints=(
             lambda: locate_previous(locate_attached),
@@ -215,13 +203,9 @@ def _evaluate_vertex(
         active=active,
         has_next=has_next,
         is_visible=visible,
-        throughput=vertex.throughput,
-        length=records.length_at(number, active),
-        frame=frame,
         incident_factor=arriving,
         optical_length=optical,
-        connection=connection,
-        polarisation_factor=inputs.polarisation_factor(number + 1),
+        distance=connection.distance,
         scattering_factor=scattered,
     )
 
@@ -381,11 +365,11 @@ def pull(
             else:
                 near = _VertexNeighbours.read(inputs, records, number, depth)
             vertex = _evaluate_vertex(inputs, records, antennas, number, near)
-            path = vertex.to_contribution()
+            path = vertex.path
             seen, scattering = vertex.is_visible, vertex.scattering_factor
             power, length, u, v = (dr.select(seen, a, 0.0) for a in gather(path, seen))
             after = _log_derivative_factor(vertex.has_next, power_sum, scattering) * scattering
-            ending = power * path.power + 0.5 * length * vertex.connection.distance
+            ending = power * path.power + 0.5 * length * vertex.distance
             ending += u * path.u + v * path.v
             power_sum = power_sum + dr.select(seen, power * dr.detach(path.power), 0.0)
             range_sum = range_sum + 0.5 * length
@@ -454,9 +438,9 @@ def push(
         with dr.resume_grad():
             near = _VertexNeighbours.read(inputs, records, number, depth)
             vertex = _evaluate_vertex(inputs, records, antennas, number, near)
-            path = vertex.to_contribution()
+            path = vertex.path
             segment = vertex.incident_factor, vertex.optical_length
-            ending = path.power, vertex.connection.distance, path.u, path.v
+            ending = path.power, vertex.distance, path.u, path.v
             values = *segment, *ending, vertex.scattering_factor
             # u and v also enter the pattern; by default their tangents would be cleared once
             # propagated.
@@ -475,7 +459,7 @@ def push(
             further = by_end[1] + dr.select(vertex.shares_segment, by_segment[1], 0.0)
         detached = (dr.detach(value) for value in (path.range, path.u, path.v))
         scatter(
-            PathContribution(vertex.frame, found, *detached),
+            PathContribution(path.frame, found, *detached),
             (power + (growth + more) * found, 0.5 * (longer + distance + further), u, v),
             vertex.is_visible,
         )

@@ -12,7 +12,7 @@ from invertwin.channel.paths import Link
 from invertwin.channel.power import integrand
 from invertwin.channel.power import random_walk as walk
 from invertwin.channel.power.bins import BinAccumulator
-from invertwin.channel.power.boundary import BoundaryPaths, BoundarySamples, trace_boundary_paths
+from invertwin.channel.power.boundary import BoundaryPaths, BoundarySamples
 from invertwin.channel.power.integrand import DIFFERENTIABLE, Inputs, SurfaceInteraction
 from invertwin.channel.power.intersection_curves import require_no_interreflection
 from invertwin.channel.power.random_walk import PathRecords, PathState, RandomWalk
@@ -198,7 +198,7 @@ class PowerTracer:
         """
         if self.boundary_samples is None:
             return iter(())
-        return trace_boundary_paths(inputs, self._walk, self.boundary_samples)
+        return self.boundary_samples.trace_paths(inputs, self._walk)
 
 
 def index_chunks(size: int, chunk: int) -> Iterator[mit.UInt32]:

@@ -246,13 +246,13 @@ def find_overlapping_pairs(
     Args:
         first, second: corners of the triangles [n, 3, 3] and [m, 3, 3] in metres.
     """
-    low, high = second.amin(1), second.amax(1)
-    rows = [torch.zeros(2, 0, dtype=torch.int64)]
-    block = max(1, _BOX_PAIRS_AT_ONCE // len(second))
-    for begin in range(0, len(first), block):
-        some = first[begin : begin + block, None]
-        met = ((some.amin(2) <= high) & (some.amax(2) >= low)).all(2)
+    least, most, low, high = first.amin(1), first.amax(1), second.amin(1), second.amax(1)
+    own = torch.nonzero(((least <= high.amax(0)) & (most >= low.amin(0))).all(1))[:, 0]
+    other = torch.nonzero(((low <= most.amax(0)) & (high >= least.amin(0))).all(1))[:, 0]
+    low, high, rows = low[other], high[other], list[Tensor]()
+    for some in own.split(max(1, _BOX_PAIRS_AT_ONCE // max(1, len(other)))):
+        met = ((least[some, None] <= high) & (most[some, None] >= low)).all(2)
         here, there = torch.nonzero(met).unbind(1)
-        rows.append(torch.stack([here + begin, there]))
+        rows.append(torch.stack([some[here], other[there]]))
     found = torch.cat(rows, 1)
     return found[0], found[1]

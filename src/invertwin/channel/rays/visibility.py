@@ -115,23 +115,14 @@ class ViewpointScene:
         """Curves in which two objects cross."""
         points, topology = strip_derivatives(self._vertices), self._topology
         corners = points[topology.faces]
-        low, high = corners.amin(1), corners.amax(1)
         none = topology.edges[:0, 0]
         parts = [intersect_triangles(points, topology, none, none)]
         for one, other in itertools.combinations(range(len(self.names)), 2):
             own = [torch.nonzero(self.face_object == number)[:, 0] for number in (one, other)]
-            for number in (0, 1):
-                there = own[1 - number]
-                bounds = low[there].amin(0), high[there].amax(0)
-                near = (low[own[number]] <= bounds[1]) & (high[own[number]] >= bounds[0])
-                own[number] = own[number][near.all(1)]
-                if not len(own[number]):
-                    break
-            if not all(map(len, own)):
-                continue
             here, there = find_overlapping_pairs(corners[own[0]], corners[own[1]])
-            met = intersect_triangles(points, topology, own[0][here], own[1][there])
-            parts.append(met.select(~met.touching))
+            if len(here):
+                met = intersect_triangles(points, topology, own[0][here], own[1][there])
+                parts.append(met.select(~met.touching))
         found = concatenate_rows(parts)
         ends = found.start, found.end
         return DiscontinuityCurves(*ends, found.first, found.second, is_intersection=True)

@@ -202,8 +202,8 @@ def trace_far_field(
     """
     with tracing():
         target = _build_target(scene, frequencies, up)
-        ends = transmitters if receivers is None else torch.cat([transmitters, receivers])
-        viewers = target.occluders.origin + _FAR * target.facets.size * ends
+        ends = [transmitters] if receivers is None else [transmitters, receivers]
+        viewers = target.occluders.origin + _FAR * target.facets.size * torch.cat(ends)
         refuse_coplanar_surfaces(target.occluders, target.vertices, viewers, list(scene.objects))
         count = len(target.facets.normal)
         if count > MAX_FACETS_BEAM_TRACING and is_differentiated(target.vertices):
@@ -216,10 +216,8 @@ def trace_far_field(
         if is_large:
             _check_inner_tubes(target)
         spacing = target.wavelength / tubes_per_wavelength if is_large else None
-        antenna_pairs = [(transmitters, transmitters if receivers is None else receivers)]
-        if receivers is not None:
-            antenna_pairs.append((receivers, transmitters))
-        tracers = [_FarFieldTracer(target, *pair) for pair in antenna_pairs]
+        pairs = zip(ends, reversed(ends), strict=True)
+        tracers = [_FarFieldTracer(target, *pair) for pair in pairs]
         with torch_threads(1):  # many small operations between rays
             found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
         # Reciprocity: mean over both directions, or over both cross-polar terms of one antenna.
@@ -487,7 +485,7 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     topology, vertices = connect_surfaces(scene)
     facets = beam_tracing.build_facets(vertices, topology)
     occluders = Occluders(vertices, topology, vertices.detach().mean(0))
-    tables = [_smooth_interfaces(scene, topology, frequency) for frequency in frequencies.tolist()]
+    tables = [_smooth_interfaces(scene, frequency) for frequency in frequencies.tolist()]
     wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in frequencies.tolist()]
     owner, names = topology.face_object, list(scene.objects)
     dielectric_solids.require_whole_solids(tables[0], topology.panels, owner, names)
@@ -496,11 +494,9 @@ def _build_target(scene: Scene, frequencies: Tensor, up: Tensor) -> _FarFieldTar
     return _FarFieldTarget(facets, topology, vertices, occluders, tables, wave_numbers, up, solids)
 
 
-def _smooth_interfaces(
-    scene: Scene, topology: Topology, frequency: float
-) -> plane_waves.SmoothInterfaces:
+def _smooth_interfaces(scene: Scene, frequency: float) -> plane_waves.SmoothInterfaces:
     """Smooth interfaces of all triangles."""
-    columns: list[list[Tensor]] = [[] for _ in plane_waves.SmoothInterfaces._fields]
+    rows = list[list[Tensor]]()
     for name, item in scene.objects.items():
         interface = item.material.smooth_interface(frequency)
         if interface is None:
@@ -512,9 +508,8 @@ def _smooth_interfaces(
         conducting = torch.tensor(interface.permittivity is None)
         epsilon = torch.ones(()) if interface.permittivity is None else interface.permittivity
         values = (conducting, epsilon.to(torch.complex128), *interface[1:4])
-        for column, value in zip(columns, values, strict=True):
-            column.append(value.expand(len(item.mesh.faces)))
-    return plane_waves.SmoothInterfaces(*map(torch.cat, columns))
+        rows.append([value.expand(len(item.mesh.faces)) for value in values])
+    return plane_waves.SmoothInterfaces(*map(torch.cat, zip(*rows, strict=True)))
 
 
 def _warn_power_gain(powers: Sequence[float]) -> None:

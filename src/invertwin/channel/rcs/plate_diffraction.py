@@ -56,7 +56,7 @@ def trace_multiple_diffractions(
             (sides, [*chain, side])
             for sides, chain in chains
             for side in range(len(sides.start))
-            if side != chain[-1] and not _share_corner(sides, side, chain[-1])
+            if not _share_corner(sides)[side, chain[-1]]
         ]
         total = torch.zeros(len(incident), 2, 3, dtype=torch.complex128)
         for sides, chain in chains:
@@ -73,21 +73,18 @@ def find_plates(wedges: Wedges) -> list[Wedges]:
         wedges: sharp edges; those of solid bodies and creases are left out.
     """
     sides = wedges.select(wedges.opening > 2 - _TOLERANCE)
-    ends = torch.stack([sides.start, sides.end], 1).detach()
-    gap = (ends[:, None, :, None] - ends[:, None]).norm(dim=-1).amin((2, 3))
     turn = cross(sides.normals[:, None, 0], sides.normals[:, 0]).norm(dim=2)
-    size = (ends[:, 1] - ends[:, 0]).norm(dim=1, keepdim=True)
-    pairs = torch.nonzero((gap < _TOLERANCE * size) & (turn < _TOLERANCE))
+    pairs = torch.nonzero(_share_corner(sides) & (turn < _TOLERANCE))
     plate = torch.from_numpy(label_components(pairs.numpy(), len(sides.start)))
     plates = [sides.select(plate == number) for number in plate.unique()]
     return [merge_collinear_wedges(edges) for edges in plates if _is_convex(edges)]
 
 
-def _share_corner(wedges: Wedges, one: int, other: int) -> bool:
-    """Test if two edges share a corner."""
-    ends = [torch.stack([wedges.start[e], wedges.end[e]]) for e in (one, other)]
-    gap = (ends[0][:, None] - ends[1][None]).norm(dim=2).min()
-    return bool(gap < _TOLERANCE * (ends[0][1] - ends[0][0]).norm())
+def _share_corner(wedges: Wedges) -> Bool[Tensor, "edge edge"]:
+    """Mask of pairs of edges with a common corner, or of one edge."""
+    ends = torch.stack([wedges.start, wedges.end], 1).detach()
+    gap = (ends[:, None, :, None] - ends[:, None]).norm(dim=-1).amin((2, 3))
+    return gap < _TOLERANCE * (ends[:, 1] - ends[:, 0]).norm(dim=1, keepdim=True)
 
 
 def _is_convex(edges: Wedges) -> bool:
@@ -113,24 +110,16 @@ def _diffract_sequence(
     # Departure points on previous edges are linear along the last one: its illuminated part is an
     # interval.
     ends = [_trace_back(wedges, sequence, directions, start + t * side) for t in (0.0, 1.0)]
-    low, high = torch.zeros_like(ends[0].path_length), torch.ones_like(ends[0].path_length)
-    for first, last, least, most in zip(
-        (*ends[0].edge_fractions.T, *ends[0].segment_lengths.T),
-        (*ends[1].edge_fractions.T, *ends[1].segment_lengths.T),
-        [0.0] * len(directions) + [_TOLERANCE * float(side.detach().norm())] * len(directions),
-        [1.0] * len(directions) + [math.inf] * len(directions),
-        strict=True,
-    ):
-        slope = last - first
-        for bound, sign in ((least, 1.0), (most, -1.0)):
-            safe = torch.where(slope.abs() > 1e-12, slope, torch.ones_like(slope))
-            crossing = (bound - first) / safe
-            rising = sign * slope > 1e-12
-            falling = sign * slope < -1e-12
-            never = ~rising & ~falling & (sign * (first - bound) <= 0)
-            low = torch.where(rising, torch.maximum(low, crossing), low)
-            high = torch.where(falling, torch.minimum(high, crossing), high)
-            high = torch.where(never, torch.full_like(high, -1.0), high)
+    shortest = _TOLERANCE * float(side.detach().norm())
+    first, last = (
+        torch.cat([e.edge_fractions, 1 - e.edge_fractions, e.segment_lengths - shortest], 1)
+        for e in ends
+    )
+    slope = last - first
+    crossing = -first / torch.where(slope.abs() > 1e-12, slope, 1.0)
+    low = torch.where(slope > 1e-12, crossing, 0.0).amax(1).clamp_min(0)
+    high = torch.where(slope < -1e-12, crossing, 1.0).amin(1).clamp_max(1)
+    high = torch.where(((slope.abs() <= 1e-12) & (first <= 0)).any(1), -1.0, high)
     row = torch.nonzero(high - low > _TOLERANCE)[:, 0].repeat_interleave(_SAMPLES_PER_EDGE)
     size = (high - low)[row] / _SAMPLES_PER_EDGE
     begin = low[row] + size * (torch.arange(len(row)) % _SAMPLES_PER_EDGE)

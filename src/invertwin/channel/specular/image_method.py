@@ -547,15 +547,9 @@ def _cast_rays(
     excess = 2 * margin / slope.clamp_min(1e-3)
     excess = torch.where(segments.plane >= 0, excess, torch.where(end_plane >= 0, -excess, -margin))
     start, reach = start + offset[:, None] * before, (length + excess).clamp_min(0.0)
-    found, row, last = (
-        torch.full_like(end_plane, -2),
-        torch.arange(len(unit)),
-        segments.plane_before,
-    )
-    width, gone = (
-        MAX_SHEETS if bool(surfaces.interactions.transmit.any()) else 0,
-        torch.zeros_like(length),
-    )
+    found, row = torch.full_like(end_plane, -2), torch.arange(len(unit))
+    last, gone = segments.plane_before, torch.zeros_like(length)
+    width = MAX_SHEETS if bool(surfaces.interactions.transmit.any()) else 0
     passed = torch.full((len(unit), width), -1)
     for number in range(width + 1):
         origin, left = start[row] + gone[:, None] * unit[row], reach[row] - gone

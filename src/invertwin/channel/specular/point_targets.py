@@ -13,8 +13,8 @@ from torch import Tensor
 
 from invertwin.channel.em.antenna_fields import antenna_fields, coherent_paths
 from invertwin.channel.em.plane_waves import polarisations
-from invertwin.channel.paths import Link, Paths, concatenate_paths
-from invertwin.channel.specular.ray_paths import RayPaths
+from invertwin.channel.paths import Link, Paths
+from invertwin.channel.specular.ray_paths import RayPaths, match_rows
 from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
@@ -73,19 +73,13 @@ def trace_point_targets(
     outbound = legs(link.tx)
     inbound = outbound if torch.equal(link.tx, link.rx) else legs(link.rx)
     strength = (4 * math.pi * sizes).sqrt() / link.wavelength
-    found = []
-    for frame in range(link.frame_count):
-        own = outbound.select(outbound.tx == frame), inbound.select(inbound.tx == frame)
-        first, last = torch.nonzero(own[0].rx[:, None] == own[1].rx).unbind(1)
-        pair = own[0].select(first), own[1].select(last)
-        outgoing, returning = (
-            fields_at_target(link, leg, transmits=transmits)
-            for leg, transmits in zip(pair, (True, False), strict=True)
-        )
-        # The target preserves the field vector in world axes.
-        fields = returning @ outgoing.mT * strength[pair[0].rx][:, None, None]
-        found.append(join_legs(link, *pair, fields))
-    return concatenate_paths(found)
+    first, last = match_rows(outbound.link, inbound.link, link.frame_count * len(positions))
+    out, back = outbound.select(first), inbound.select(last)
+    outgoing = fields_at_target(link, out, transmits=True)
+    returning = fields_at_target(link, back, transmits=False)
+    # The target preserves the field vector in world axes.
+    fields = returning @ outgoing.mT * strength[out.rx][:, None, None]
+    return join_legs(link, out, back, fields)
 
 
 def join_legs(

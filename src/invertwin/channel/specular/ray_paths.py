@@ -106,13 +106,10 @@ class RayPaths(Rows):
         ``paths.delay[row]`` is then a table of delays; multiply by the mask to clear the padding.
         """
         count = torch.bincount(self.link, minlength=self.counts[0] * self.counts[1])
-        order = self.link.argsort(stable=True)
-        position = torch.arange(len(self)).to(order) - (count.cumsum(0) - count)[self.link[order]]
-        shape = (len(count), int(count.max()) if len(count) else 0)
-        row = order.new_zeros(shape)
-        filled = torch.zeros_like(row, dtype=torch.bool)
-        row[self.link[order], position] = order
-        filled[self.link[order], position] = True
+        width = int(count.max()) if len(count) else 0
+        filled = torch.arange(width, device=count.device) < count[:, None]
+        row = torch.zeros_like(filled, dtype=torch.int64)
+        row[filled] = self.link.argsort(stable=True)
         return row.unflatten(0, self.counts), filled.unflatten(0, self.counts)
 
     def reverse(self) -> "RayPaths":

@@ -261,37 +261,32 @@ def _diffracted_columns(
     k = 2 * math.pi * path_scene.frequency / SPEED_OF_LIGHT
     found = evaluate_diffracted_paths(wedge_scene, candidates, path_scene.tx, path_scene.rx, k)
     ways = found.directions.unbind(1)
-    departure, arrival = ways[0], -ways[-1]
     sent, received = (
-        plane_waves.polarisations(way).to(found.transfer) for way in (departure, arrival)
+        plane_waves.polarisations(way).to(found.transfer) for way in (ways[0], -ways[-1])
     )
     matrix = torch.einsum("pri,pij,ptj->prt", received, found.transfer, sent)
     slopes = torch.einsum("pri,psij,ptj->psrt", received, found.slopes, sent)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi)
-    columns = {
+    legs = _leg_columns(path_scene, found.tx, found.rx, ways, found.points, found.faces)
+    columns = legs | {
         "delay": found.length / SPEED_OF_LIGHT,
         "coefficient": matrix * scale,
-        "departure": departure,
-        "arrival": arrival,
-        "vertices": found.points,
         "kinds": found.kinds,
-        "faces": found.faces,
-        "doppler": _doppler_shifts(path_scene, found.tx, found.rx, ways, found.points, found.faces),
     }
     if candidates.edge.shape[1] > 1:
         return columns
     return columns | {"slopes": slopes * scale, "axes": found.axes}
 
 
-def _doppler_shifts(
+def _leg_columns(
     path_scene: PathScene,
     tx: Tensor,
     rx: Tensor,
     directions: Sequence[Tensor],
     vertices: Float64[Tensor, "path vertex 3"],
     faces: Int64[Tensor, "path vertex"],
-) -> Float64[Tensor, " path"]:
-    """Doppler shifts [Hz], from the rate at which path lengths decrease."""
+) -> _Columns:
+    """Columns of the legs, with Doppler shifts from the rate at which path lengths decrease."""
     rate = plane_waves.dot(directions[0], path_scene.tx_velocity[tx])
     rate = rate - plane_waves.dot(directions[-1], path_scene.rx_velocity[rx])
     if path_scene.velocities is not None and faces.shape[1]:
@@ -300,7 +295,9 @@ def _doppler_shifts(
         moved = plane_waves.interpolate_vectors(speeds, corners, vertices)
         for step in range(faces.shape[1]):
             rate = rate + plane_waves.dot(directions[step + 1] - directions[step], moved[:, step])
-    return path_scene.frequency / SPEED_OF_LIGHT * rate
+    doppler = path_scene.frequency / SPEED_OF_LIGHT * rate
+    ends = {"departure": directions[0], "arrival": -directions[-1]}
+    return ends | {"vertices": vertices, "faces": faces, "doppler": doppler}
 
 
 def evaluate_paths(path_scene: PathScene, specular_paths: SpecularPaths) -> list[RayPaths]:
@@ -328,15 +325,10 @@ def _specular_columns(path_scene: PathScene, paths: SpecularPaths) -> _Columns:
     matrix = _transfer_matrix(path_scene, paths, units, unfolded.normal)
     scale = SPEED_OF_LIGHT / path_scene.frequency / (4 * math.pi) / distance
     ends = paths.source, paths.target
-    return {
+    return _leg_columns(path_scene, *ends, units, vertices, paths.faces) | {
         "delay": distance / SPEED_OF_LIGHT,
         "coefficient": matrix * scale[:, None, None],
-        "departure": units[0],
-        "arrival": -units[-1],
-        "vertices": vertices,
         "kinds": torch.where(paths.transmitted, TRANSMISSION, REFLECTION),
-        "faces": paths.faces,
-        "doppler": _doppler_shifts(path_scene, *ends, units, vertices, paths.faces),
     }
 
 
