@@ -216,7 +216,7 @@ def trace_far_field(
         if is_large:
             _check_inner_tubes(target)
         spacing = target.wavelength / tubes_per_wavelength if is_large else None
-        pairs = zip(ends, reversed(ends), strict=True)
+        pairs = list(zip(ends, reversed(ends), strict=True))
         tracers = [_FarFieldTracer(target, *pair) for pair in pairs]
         with torch_threads(1):  # many small operations between rays
             found = [tracer.trace_parts(depth, edges, spacing, boundary) for tracer in tracers]
@@ -224,7 +224,7 @@ def trace_far_field(
         parts = {name: (found[0][name] + found[-1][name].mT) / 2 for name in found[0]}
         residual = None
         if edges > 0 and target.is_smooth_metal:
-            residual = _residual_field(target, antenna_pairs, torch.stack([*parts.values()]).sum(0))
+            residual = _residual_field(target, pairs, torch.stack([*parts.values()]).sum(0))
         _warn_validity(scene, target, tubes_per_wavelength, spacing, residual is not None)
         return parts if residual is None else parts | {"rest": residual}
 
