@@ -54,18 +54,25 @@ def find_rigid_groups(
     near = mesh_topology.overlapping_boxes(low - reach, high + reach) & (moves[:, None] == moves)
     if scenes is not None:
         near &= np.equal.outer(scenes, scenes)
-    pairs, gaps = [], []
+    pairs, rows = [], []  # of vertex, two ends of an edge, position between them, and size
     for a, b in np.argwhere(np.triu(near)).tolist():
         key = a, b, id(faces[a]), id(faces[b])
-        contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b]))
+        contacts = _find_contacts(key, (faces[a], faces[b]), (fixed[a], fixed[b])).numpy()
         if len(contacts) > 1:
             pairs.append((a, b))
-            points = torch.cat([vertices[a], vertices[b]])[contacts[:, :3].long()]
-            points = points / float(size[[a, b]].max())
-            gaps.append((points[:, 0], torch.lerp(points[:, 1], points[:, 2], contacts[:, 3:])))
-    # One comparison for all pairs, as a rule; else one for each.
-    if pairs and not _move_as_one(*map(torch.cat, zip(*gaps, strict=True))):
-        pairs = list(itertools.compress(pairs, [_move_as_one(*gap) for gap in gaps]))
+            row = np.insert(contacts, 4, size[[a, b]].max(), axis=1)
+            count = len(fixed[a])
+            row[:, :3] += np.where(row[:, :3] < count, start[a], start[b] - count)
+            rows.append(row)
+    if pairs:
+        contacts = torch.from_numpy(np.concatenate(rows))
+        share, extent = contacts[:, 3:].split(1, 1)
+        points = torch.cat([*vertices])[contacts[:, :3].long()] / extent[..., None]
+        gaps = points[:, 0], torch.lerp(points[:, 1], points[:, 2], share)
+        # One comparison for all pairs, as a rule; else one for each.
+        if not _move_as_one(*gaps):
+            parts = zip(*(side.split([*map(len, rows)]) for side in gaps), strict=True)
+            pairs = list(itertools.compress(pairs, [_move_as_one(*part) for part in parts]))
     return mesh_topology.label_components(
         np.array(pairs, dtype=np.int64).reshape(-1, 2), len(faces)
     )
@@ -116,13 +123,25 @@ def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"])
     Args:
         before, after: positions [m].
     """
-    # In NumPy, where torch's threads wait longer for each other than they work, and with means as
-    # products, ten times faster than along the axis.
-    if before.shape != after.shape or np.array_equal(before, after):
-        return before.shape == after.shape
-    one, other = (p - np.full(len(p), 1 / len(p)) @ p for p in (before.numpy(), after.numpy()))
-    u, _, v = np.linalg.svd(one.T @ other)
-    return bool(np.abs(one @ (u @ v) - other).max() <= _SAME_PLACE * np.abs(other).max())
+    # In NumPy, where torch's threads wait longer for each other than they work.
+    one, other = before.numpy(), after.numpy()
+    if one.shape != other.shape or np.array_equal(one, other):
+        return one.shape == other.shape
+    # The motion of few points, as a rule; else that of all, should the few lie in a plane.
+    return _fits_motion(one, other, len(one) // 64 or 1) or _fits_motion(one, other, 1)
+
+
+def _fits_motion(
+    before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"], step: int
+) -> bool:
+    """Test whether the best motion of every ``step``-th point is that of all."""
+    one, other = before[::step], after[::step]
+    middle, target = one.mean(0), other.mean(0)
+    u, _, v = np.linalg.svd((one - middle).T @ (other - target))
+    gap = before @ (u @ v)
+    gap += target - middle @ u @ v
+    gap -= after
+    return bool(np.abs(gap).max() <= _SAME_PLACE * np.abs(other - target).max())
 
 
 def _move_as_one(first: Float64[Tensor, "n 3"], second: Float64[Tensor, "n 3"]) -> bool:

@@ -72,8 +72,12 @@ class Topology:
         tables = edge_tables(edges, places, face_object.numpy())
         # Of each object, side by side: samples that follow this order are spread over its surface.
         start, end = tables[0].T
-        order = torch.from_numpy(morton_order((vertices[start] + vertices[end]).numpy()))
-        order = order[mesh_topology.sort_rows(owner[start[order]].numpy(), count=len(groups))[0]]
+        middle = vertices[start].add_(vertices[end])
+        order = torch.from_numpy(morton_order(middle.numpy()))
+        if len(groups) > 1:
+            order = order[
+                mesh_topology.sort_rows(owner[start[order]].numpy(), count=len(groups))[0]
+            ]
         self.edges, self.edge_apexes, self.edge_faces = (table[order] for table in tables)
         beside = self.edge_faces
         self.open_objects = _open_objects(beside, face_object)
@@ -281,7 +285,7 @@ def _turn_outwards(
             low, high = int(own.min()), int(own.max())
             found = mesh_topology.find_inward_faces((own - low).numpy(), places[low : high + 1])
             turned.copy_(torch.from_numpy(found))
-    return torch.where(inward[:, None], faces.flip(1), faces)
+    return torch.where(inward[:, None], faces.flip(1), faces) if inward.any() else faces
 
 
 def edge_tables(
