@@ -164,7 +164,7 @@ def test_the_legend_names_groups_with_all_their_colours_and_nothing_acts():
     ]
     text = legend_html(Display("title", layers))
     assert "paths: &lt;b&gt;" in text
-    assert '>-80 <span style="letter-spacing: -0.15em"><span style="color: rgb(4, 5, 6)">' in text
+    assert '>-80 <span style="letter-spacing: -0.3em"><span style="color: rgb(4, 5, 6)">' in text
     assert 'rgb(7, 8, 9)">■</span></span>&ensp;-80 dBm<' in text
 
 

@@ -410,14 +410,15 @@
     part("layers").append(label);
   }
   // Bands of a map of levels come with the lowest first, which the slider hides.
-  const bands = layers.filter((layer) => layer.group === "levels");
+  const bands = layers.filter((layer) => layer.group === "levels" && layer.band);
   if (bands.length > 1) {
     const label = document.createElement("label"), slider = document.createElement("input"), said = document.createElement("output");
     Object.assign(slider, { type: "range", min: 0, max: bands.length - 1, value: 0 });
     const hide = () => {
       const shown = bands.some((layer) => layer.shown);
       bands.forEach((layer, k) => { layer.hidden = k < slider.value; layer.shown = shown && !layer.hidden; });
-      said.textContent = ` from ${bands[slider.value].name.split("/")[1].split(" ")[0]} up`;
+      const { band, unit } = bands[slider.value];
+      said.textContent = ` from ${Number(band[0].toPrecision(4))} ${unit} up`;
       draw();
     };
     slider.addEventListener("input", hide);

@@ -98,8 +98,8 @@ def legend_html(display: Display) -> str:
         row = f"{marks} {escape(name)}"
         bands = [x.band for x in own if x.band and name == LEVELS]
         if len(bands) > 1:  # the lowest band has no power in some cells
-            strip = f'<span style="letter-spacing: -0.15em">{marks}</span>&ensp;'
-            row = f"{bands[0][1]:.4g} {strip}{bands[-1][0]:.4g} {escape(own[-1].unit)}"
+            strip = f'<span style="letter-spacing: -0.3em">{marks}</span>&ensp;'
+            row = f"{bands[0][1]:.3g} {strip}{bands[-1][0]:.3g} {escape(own[-1].unit)}"
         rows.append(f"<span {_WHOLE}>{row}</span>")
     # On phones viser has letters of 10 pixels.
     style = "#webgl-software-rendering { display: none } html { font-size: 14.8px !important }"
