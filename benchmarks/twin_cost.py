@@ -10,7 +10,8 @@ own. Prints a table and writes `metrics.json` into DIR (default `out/twin_cost`)
 - `positions_<n>_seconds`: processor time with n positions, 128 samples and 2 objects [s].
 - `samples_<n>_seconds`, `objects_<n>_seconds`: the same with n samples, or n objects, at 16
   positions.
-- `positions_exponent`: slope of the logarithm of the time over that of the positions; 1 = linear.
+- `positions_exponent`, `samples_exponent`: slope of the logarithm of the time over that of the
+  positions or samples; 1 = linear.
 - `found_share`: share of the boxes that are found within 0.15 m, over all rows.
 - `memory_gb`: most memory held by a row.
 """
@@ -32,6 +33,7 @@ REQUIRED: Required = {
     "positions_16_seconds": ("<=", 180.0),
     "positions_64_seconds": ("<=", 600.0),
     "positions_exponent": ("<=", 1.1),
+    "samples_exponent": ("<=", 1.1),
 }
 PLACES = ((2.4, -0.9), (2.7, 0.7), (3.4, 0.1))  # middles of the boxes [m]
 NEAR = 0.15  # [m]
@@ -93,9 +95,10 @@ def measure(positions: list[int], samples: list[int], objects: list[int]) -> dic
     metrics: dict[str, Any] = {
         f"{name}_{n}_seconds": done[row]["seconds"] for (name, n), row in rows.items()
     }
-    if len(positions) > 1:
-        times = [done[rows["positions", n]]["seconds"] for n in positions]
-        metrics["positions_exponent"] = float(np.polyfit(np.log(positions), np.log(times), 1)[0])
+    for name, counts in (("positions", positions), ("samples", samples)):
+        if len(counts) > 1:
+            times = [done[rows[name, n]]["seconds"] for n in counts]
+            metrics[f"{name}_exponent"] = float(np.polyfit(np.log(counts), np.log(times), 1)[0])
     metrics["found_share"] = sum(one["found"] for one in done.values()) / sum(r[2] for r in done)
     metrics["memory_gb"] = max(one["memory_gb"] for one in done.values())
     return metrics

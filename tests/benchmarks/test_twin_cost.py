@@ -9,15 +9,16 @@ def test_rows_in_common_are_measured_once(twin_cost, monkeypatch):
     def run(call, **_):
         row = [int(number) for number in call[3:]]
         calls.append(row)
-        text = f'progress\n{{"seconds": {2.0 * row[0] ** 1.5}, "found": 1, "memory_gb": 0.5}}\n'
+        text = f'progress\n{{"seconds": {row[0] ** 1.5 * row[1]}, "found": 1, "memory_gb": 0.5}}\n'
         return type("Finished", (), {"stdout": text})
 
     monkeypatch.setattr(twin_cost.subprocess, "run", run)
-    metrics = twin_cost.measure([8, 16], [128], [2, 3])
-    assert calls == [[8, 128, 2], [16, 128, 2], [16, 128, 3]]
+    metrics = twin_cost.measure([8, 16], [64, 128], [2, 3])
+    assert calls == [[8, 128, 2], [16, 128, 2], [16, 64, 2], [16, 128, 3]]
     assert metrics["positions_exponent"] == pytest.approx(1.5)
+    assert metrics["samples_exponent"] == pytest.approx(1.0)
     assert metrics["positions_16_seconds"] == metrics["samples_128_seconds"]
-    assert metrics["found_share"] == 3 / 7
+    assert metrics["found_share"] == 4 / 9
     assert metrics["memory_gb"] == 0.5
 
 
