@@ -10,7 +10,7 @@ diagonal of 1, and groups stand side by side (``separate_groups``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import igl
@@ -172,12 +172,7 @@ def weld_vertices(places: Points) -> Int64[np.ndarray, " v"]:
     order = np.empty(len(along), dtype=np.int64)
     np.multiply(along, finest / max(along.max(), 1.0), out=order, casting="unsafe")
     sort_order(order)
-
-    def differ(rows: slice) -> Bool[np.ndarray, " block"]:
-        columns = places.take(order[rows.start : rows.stop + 1], 0).T
-        return (columns[:, 1:] != columns[:, :-1]).any(0)
-
-    start = np.flatnonzero(np.append(True, _by_blocks(differ, len(order))))
+    start = _find_runs(lambda rows: places.take(order[rows], 0).T, len(order))
     lowest = order[start]
     pairs = _find_close_pairs(places[lowest], along[lowest])
     if len(pairs):
@@ -196,17 +191,13 @@ def sort_order(numbers: Numbers) -> Numbers:
     Their places stand below them in one number each: nine times faster than a stable sort. In their
     own memory, since the first touch of new memory costs as much as the sort.
     """
-    _sort_with_places(numbers)
-    numbers &= (1 << len(numbers).bit_length()) - 1
-    return numbers
-
-
-def _sort_with_places(numbers: Numbers) -> None:
-    """Replace numbers by sorted ones, with their places in as many bits as the length has."""
-    numbers <<= len(numbers).bit_length()
+    bits = len(numbers).bit_length()
+    numbers <<= bits
     for start in range(0, len(numbers), _BLOCK):
         numbers[start : start + _BLOCK] |= np.arange(start, min(start + _BLOCK, len(numbers)))
     numbers.sort()
+    numbers &= (1 << bits) - 1
+    return numbers
 
 
 def _find_close_pairs(places: Points, along: Float64[np.ndarray, " v"]) -> Int64[np.ndarray, "n 2"]:
@@ -234,18 +225,10 @@ def sort_rows(*columns: Numbers, count: int) -> tuple[Numbers, Int64[np.ndarray,
         return np.arange(size), np.arange(min(size, 1))
     held = max(1, (63 - size.bit_length()) // bits)  # columns that one number holds
     parts = [columns[max(0, end - held) : end] for end in range(len(columns), 0, -held)]
-    order = _pack_columns(parts[0], bits)
-    _sort_with_places(order)
-
-    def differ(rows: slice) -> Bool[np.ndarray, " block"]:  # without their places
-        code = order[rows.start : rows.stop + 1] >> size.bit_length()
-        return code[1:] != code[:-1]
-
-    start = np.flatnonzero(np.append(size > 0, _by_blocks(differ, size)))
-    order &= (1 << size.bit_length()) - 1
+    order = sort_order(_pack_columns(parts[0], bits))
     for part in parts[1:]:
         order = order.take(sort_order(_pack_columns(part, bits).take(order)))
-    return order, start if len(parts) == 1 else _find_runs([c.take(order) for c in columns])
+    return order, _find_runs(lambda rows: [column.take(order[rows]) for column in columns], size)
 
 
 def _pack_columns(columns: Sequence[Numbers], bits: int) -> Numbers:
@@ -257,11 +240,16 @@ def _pack_columns(columns: Sequence[Numbers], bits: int) -> Numbers:
     return code
 
 
-def _find_runs(columns: Sequence[np.ndarray]) -> Int64[np.ndarray, " u"]:
-    """Return where runs of equal rows begin."""
-    begins = np.ones(len(columns[0]), dtype=bool)
-    begins[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
-    return np.flatnonzero(begins)
+def _find_runs(
+    columns: Callable[[slice], Iterable[np.ndarray]], count: int
+) -> Int64[np.ndarray, " u"]:
+    """Return where runs of equal rows begin, of columns that a function returns for some rows."""
+
+    def differ(rows: slice) -> Bool[np.ndarray, " block"]:
+        some = columns(slice(rows.start, rows.stop + 1))
+        return np.logical_or.reduce([column[1:] != column[:-1] for column in some])
+
+    return np.flatnonzero(np.append(count > 0, _by_blocks(differ, count)))
 
 
 def label_components(pairs: Int64[np.ndarray, "n 2"], count: int) -> Int64[np.ndarray, " node"]:
@@ -290,13 +278,14 @@ def overlapping_boxes(
     return meets & meets.T
 
 
-def triangle_sides(faces: Faces) -> Int64[np.ndarray, "h 2"]:
-    """Return the ends of the sides of triangles in their direction: all first sides, and so on.
+def triangle_sides(faces: Faces) -> tuple[Numbers, Numbers]:
+    """Return start and end of the sides of triangles: all first sides, and so on.
 
     Args:
         faces: vertices of each triangle.
     """
-    return np.stack([faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()]).T
+    a, b, c = faces.T
+    return np.concatenate([a, b, c]), np.concatenate([b, c, a])
 
 
 def separate_groups(points: Points, groups: Groups, faces: Faces) -> Points:
@@ -376,9 +365,9 @@ def _whole_edges(faces: Faces, places: Points, owner: Owner) -> MeshEdges:
 
 def _sides_of(faces: Faces, number: Numbers, vertex_count: int) -> MeshEdges:
     """Group the sides of some triangles by edges."""
-    a, b, c = (faces if len(number) == len(faces) else faces[number]).T
-    ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
-    return _group_sides(*ends, np.concatenate([c, a, b]), np.tile(number, 3), vertex_count)
+    used = faces if len(number) == len(faces) else faces[number]
+    apex = np.concatenate([used[:, 2], used[:, 0], used[:, 1]])
+    return _group_sides(*triangle_sides(used), apex, np.tile(number, 3), vertex_count)
 
 
 def _by_blocks(function: Callable[[slice], np.ndarray], count: int) -> np.ndarray:
@@ -455,10 +444,11 @@ def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 def _group_sides(
     start: Numbers, end: Numbers, apex: Numbers, triangle: Numbers, vertex_count: int
 ) -> MeshEdges:
+    """Group half edges by their edges, in the memory of ``end``, which is lost."""
     low, high = np.minimum(start, end), np.maximum(start, end, out=end)
     order, first = sort_rows(low, high, count=vertex_count)
     ends = np.stack([low[order[first]], high[order[first]]], 1)
-    apex.take(order, out=low, mode="clip")  # in memory at hand, as above
+    apex.take(order, out=low, mode="clip")  # new memory would take longer, as in sort_order
     triangle.take(order, out=high, mode="clip")
     return MeshEdges(ends, np.diff(first, append=len(order)), low, high)
 

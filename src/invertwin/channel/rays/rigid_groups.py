@@ -67,7 +67,9 @@ def find_rigid_groups(
     if pairs:
         contacts = torch.from_numpy(np.concatenate(rows))
         share, extent = contacts[:, 3:].split(1, 1)
-        points = torch.cat([*vertices])[contacts[:, :3].long()] / extent[..., None]
+        touching = np.unique(pairs)  # derivatives of other objects would be found in vain
+        points = torch.cat([vertices[n] if n in touching else p for n, p in enumerate(fixed)])
+        points = points[contacts[:, :3].long()] / extent[..., None]
         gaps = points[:, 0], torch.lerp(points[:, 1], points[:, 2], share)
         # One comparison for all pairs, as a rule; else one for each.
         if not _move_as_one(*gaps):
@@ -103,7 +105,8 @@ def _find_contacts(
         corners = points[number][triangles]
         inside = (corners.amin(1) <= high + margin) & (corners.amax(1) >= low - margin)
         used = (strip_derivatives(triangles)[inside.all(1)] + offset).numpy()
-        edges.append(np.unique(np.sort(mesh_topology.triangle_sides(used), axis=1), axis=0))
+        sides = np.column_stack(mesh_topology.triangle_sides(used))
+        edges.append(np.unique(np.sort(sides, axis=1), axis=0))
     parts = []
     for own, other in ((0, 1), (1, 0)):
         row, vertex, share = mesh_topology.find_vertices_on_edges(
@@ -128,7 +131,8 @@ def is_one_motion(before: Float64[Tensor, "n 3"], after: Float64[Tensor, "m 3"])
     if one.shape != other.shape or np.array_equal(one, other):
         return one.shape == other.shape
     # The motion of few points, as a rule; else that of all, should the few lie in a plane.
-    return _fits_motion(one, other, len(one) // 64 or 1) or _fits_motion(one, other, 1)
+    steps = sorted({len(one) // 64 or 1, 1}, reverse=True)
+    return any(_fits_motion(one, other, step) for step in steps)
 
 
 def _fits_motion(
