@@ -50,18 +50,18 @@ def trace_multiple_diffractions(
         max_diffractions: maximum number of diffractions.
         is_visible: visibility test of edge points from the source.
     """
-    chains = [(sides, [side]) for sides in plates for side in range(len(sides.start))]
+    apart = [~_share_corner(sides) for sides in plates]
+    chains = [(plate, [side]) for plate, own in enumerate(apart) for side in range(len(own))]
     for _ in range(2, max_diffractions + 1):
         chains = [
-            (sides, [*chain, side])
-            for sides, chain in chains
-            for side in range(len(sides.start))
-            if not _share_corner(sides)[side, chain[-1]]
+            (plate, [*chain, side])
+            for plate, chain in chains
+            for side in torch.nonzero(apart[plate][:, chain[-1]])[:, 0].tolist()
         ]
         total = torch.zeros(len(incident), 2, 3, dtype=torch.complex128)
-        for sides, chain in chains:
+        for plate, chain in chains:
             total = total + _diffract_sequence(
-                sides, chain, wave_number, incident, field, scattering_direction, is_visible
+                plates[plate], chain, wave_number, incident, field, scattering_direction, is_visible
             )
         yield total
 
