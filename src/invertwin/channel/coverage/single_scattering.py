@@ -210,8 +210,9 @@ class SingleScatteringTracer:
             rows &= (strip_derivatives(geometry.surfaces.amplitude) > 0).any(1)
             self.is_scattering: Bool[Tensor, " f"] = rows[geometry.face_surface]
             vertices, ends = strip_derivatives(stage.vertices), torch.cat(self.antennas)
-            occluders = vertices, stage.topology, ends, interactions
-            self.surfaces = image_method.CandidateSurfaces(*occluders)
+            self.surfaces = image_method.CandidateSurfaces(
+                vertices, stage.topology, ends, interactions
+            )
             self.sequences = tuple(self._find_sequences(number, rays) for number in range(2))
 
     def _find_sequences(self, end: int, rays: int | None) -> tuple[Tensor, ...]:

@@ -93,7 +93,6 @@ def find_sequences(
         return CandidateSequences((), None)
     if rays is None:
         return enumerate_sequences(surfaces, depth)
-    # A ray may split at every step.
     chunk = _count_lanes(surfaces, depth)
     leaves = torch.zeros(0, depth, dtype=torch.int64)
     count = torch.zeros(0, dtype=torch.int64)

@@ -418,15 +418,15 @@ def intersects_planes(
         images: result of ``image_positions``, relative to the scene's origin [m].
         target: positions relative to the scene's origin [m].
     """
-    planes, plane = surfaces.planes, steps
-    point, normal = planes.point[plane], planes.normal[plane]
+    planes = surfaces.planes
+    point, normal = planes.point[steps], planes.normal[steps]
     nodes = torch.stack([*interaction_points(target, images, point, normal), target], 1)
     start, ray = nodes[:, 1:], torch.stack(images, 1)[:, 1:] - nodes[:, 1:]
     slope, length = waves.dot(ray, normal), ray.norm(dim=2)
     distance = waves.dot(point - start, normal) / replace_zeros(slope) * length
-    at = torch.einsum("rsx,rsax->rsa", nodes[:, :-1] - point, planes.axes[plane])
-    inside = (at >= planes.low[plane] - surfaces.margin) & (
-        at <= planes.high[plane] + surfaces.margin
+    at = torch.einsum("rsx,rsax->rsa", nodes[:, :-1] - point, planes.axes[steps])
+    inside = (at >= planes.low[steps] - surfaces.margin) & (
+        at <= planes.high[steps] + surfaces.margin
     )
     tolerance = _EXACT_TOLERANCE * surfaces.size
     # A receiver in a reflecting plane has a reflection.
@@ -453,16 +453,16 @@ def find_unobstructed_paths(
         Mask of paths; their triangles from the source on, sheets included, padded with −1 at the
         end; and a mask of those that transmit.
     """
-    count, planes, plane = len(steps), surfaces.planes, steps
+    count, planes = len(steps), surfaces.planes
     if not count:
         return torch.zeros(0, dtype=torch.bool), torch.zeros_like(steps), steps.bool()
-    point, normal = planes.point[plane], planes.normal[plane]
+    point, normal = planes.point[steps], planes.normal[steps]
     images, target = surfaces.images(source, steps), targets - surfaces.origin
     nodes = torch.stack([images[0], *interaction_points(target, images, point, normal), target], 1)
     none = torch.full((count, 1), -1)
-    before, after = torch.cat([none, plane], 1), torch.cat([plane, none], 1)
+    before, after = torch.cat([none, steps], 1), torch.cat([steps, none], 1)
     target_plane = none if target_planes is None else target_planes[:, None]
-    last = torch.cat([torch.full_like(plane, -1), target_plane], 1)
+    last = torch.cat([torch.full_like(steps, -1), target_plane], 1)
     starts, ends = nodes[:, :-1].reshape(-1, 3), nodes[:, 1:].reshape(-1, 3)
     segments = _SpecularSegments(starts, ends, before.ravel(), after.ravel(), last.ravel())
     faces, valid, passed = _test_segments(surfaces, segments)
