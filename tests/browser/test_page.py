@@ -14,7 +14,7 @@ from PIL import Image, ImageChops, ImageFilter
 from browser.ball import EVIL, shown
 from browser.references import APART, apart, blocks, difference
 from invertwin.cli.report import ReportTable, ReportView, report_html
-from invertwin.viewer import Display, InteractiveSensor, page_html, view_html
+from invertwin.viewer import Display, DisplayLayer, InteractiveSensor, page_html, view_html
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -166,6 +166,24 @@ def test_a_click_lights_what_feeds_a_bin_for_every_sensor_and_position(
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] - 2)
     page.wait_for_timeout(1000)
     assert ": 0 points" in page.locator("[data-part=told]").inner_text()
+    assert watched.errors == []
+
+
+def test_the_slider_of_levels_reads_their_values_whatever_the_layers_are_called(watched, tmp_path):
+    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    layers = [
+        DisplayLayer(name, "surface", square + k, np.arange(3, dtype=np.int32)[None], band=band)
+        for k, (name, band) in enumerate(
+            {"levels": (-90.0, -80.0), "levels/b": (-80.0, -72.55)}.items()
+        )
+    ]
+    file = tmp_path / "page.html"
+    file.write_text(page_html(Display("title", layers)), encoding="utf-8")
+    watched.page.goto(file.as_uri())
+    label = watched.page.get_by_text("lowest level")
+    assert "from -90" in label.inner_text()
+    label.locator("input").press("End")
+    assert "from -80" in label.inner_text()
     assert watched.errors == []
 
 
