@@ -210,7 +210,7 @@ def measure_derivatives(samples: int) -> dict[str, float]:
 
     def loss(name: str, value: Tensor, count: int) -> Tensor:
         given = {key: vector(number)[0] for key, number in start.items()} | {name: value}
-        how = Sampling(3, count, boundary_samples=20_000)
+        how = Sampling(3, count, boundary_samples=160_000)
         scene = crate(*given.values())
         found = deposit_mirrored_power(scene, shared, grid, ["wall"], sampling=how, seed=1)
         return 1e12 * (found[0, :, 0, 0] * weights)[grid.ranges > 2].sum()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from invertwin.channel import Grid, Link, Sampling, deposit_power, draw_speckle, trace_field
+from invertwin.channel.coverage import shadow_boundaries
 from invertwin.channel.coverage.mirrors import (
     deposit_mirrored_power,
     trace_field_with_mirrors,
@@ -40,7 +41,7 @@ WAVELENGTH = 0.004
 GRID = Grid(0.4, 0.05, 120)
 ORIGIN = float64([[0.0, 0.0, 0.0]])
 IMAGE = float64([[0.0, -1.0, 0.0]])  # of the origin in the wall
-SAMPLING = Sampling(3, 400_000, boundary_samples=20_000, conductor_samples=20_000)
+SAMPLING = Sampling(3, 400_000, boundary_samples=160_000, conductor_samples=20_000)
 PAINT = RoughDielectric(5.0)
 
 
@@ -162,7 +163,7 @@ def test_derivatives_are_those_of_differences(name, step):
         return 1e12 * (powers(crate(*given.values()), **how) * weights)[GRID.ranges > 2].sum()
 
     slopes = []
-    for boundary in (20_000, 0):
+    for boundary in (160_000, 0):
         value = float64(start[name]).requires_grad_()
         how = {"samples": 3_200_000, "boundary_samples": boundary}
         slopes.append(torch.autograd.grad(loss(value, **how), value)[0].item())
@@ -172,6 +173,25 @@ def test_derivatives_are_those_of_differences(name, step):
     assert slopes[0] == pytest.approx(difference, rel=0.03)
     if name == "crate":
         assert slopes[1] != pytest.approx(difference, rel=0.2)  # what becomes hidden counts
+
+
+def test_edges_left_out_cast_no_boundary(monkeypatch):
+    def slope() -> float:
+        value = float64(0.0).requires_grad_()
+        scene = crate(value, float64(0.0), float64(5.0))
+        power = powers(scene, samples=64, boundary_samples=16_000).sum()
+        return 1e12 * torch.autograd.grad(power, value)[0].item()
+
+    some, tested = slope(), []
+
+    def keep_all(_: object, edges: Tensor, *__: Tensor, **___: bool) -> Tensor:
+        tested.append(len(edges))
+        return torch.ones(len(edges), dtype=torch.bool)
+
+    monkeypatch.setattr(shadow_boundaries, "_cast_boundaries", keep_all)
+    assert slope() == pytest.approx(some, rel=1e-9)
+    assert sum(tested) > 1000
+    assert abs(some) > 1.0
 
 
 def test_what_is_no_mirror_is_named():

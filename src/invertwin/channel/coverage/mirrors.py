@@ -48,6 +48,7 @@ _Points = radar_equation.SurfacePaths
 _SEARCH_RAYS = 100_000
 _FEW_TRIANGLES = 48  # that reflect or transmit: every sequence of their planes is tested
 _RAYS_PER_POINT = 64  # rays of power paths at the cost of one point
+_SAMPLES_PER_EDGE_POINT = 8  # silhouette samples of power paths at the cost of one edge point
 
 
 def deposit_mirrored_power(
@@ -200,7 +201,11 @@ class _MirrorSearch:
         self.stage = replace(stage, velocities=None)
         active = trace_paths.face_interactions(self.stage)
         few = int((active.reflect | active.transmit).sum()) <= _FEW_TRIANGLES
-        drawn = replace(sampling, samples=max(1, sampling.samples // _RAYS_PER_POINT))
+        drawn = replace(
+            sampling,
+            samples=max(1, sampling.samples // _RAYS_PER_POINT),
+            boundary_samples=-(-sampling.boundary_samples // _SAMPLES_PER_EDGE_POINT),
+        )
         pairing: single_scattering.Pairing = "monostatic" if link.shared_visibility else "frames"
         how = None if few else _SEARCH_RAYS, drawn, seed, pairing
         self.tracer = single_scattering.SingleScatteringTracer(self.stage, self.geometry, *how)

@@ -204,15 +204,27 @@ def sample_illumination_boundaries(
         seed: random seed of the points.
     """
     topology, found = surfaces.topology, list[IlluminationBoundarySamples]()
+    folds = _find_folds(surfaces)
     for number, source in enumerate(tx):
-        casts = _casting_edges(surfaces, None if depth else source)
+        casts = folds
+        if not depth:
+            image = (source - surfaces.origin).expand(len(folds), 3)
+            casts = folds[_cast_boundaries(surfaces, folds, image, reflects=False)]
         start, end = surfaces.exact_vertices[topology.edges[casts]].unbind(1)
         row, *place = sample_along_curves((end - start).norm(dim=1), samples, seed, number)
         if not len(row):
             continue
         edges, ends = _EdgeSamples(topology.edges[casts[row]], *place), (start[row], end[row])
         y = torch.lerp(ends[0], ends[1], edges.fraction[:, None])
-        paths = find_paths_along(surfaces, sequences, source[None], y + surfaces.origin)
+
+        def is_needed(
+            sources: Tensor, steps: Tensor, target: Tensor, edge: Tensor = casts[row]
+        ) -> Tensor:
+            image = surfaces.images(sources, steps)[-1]
+            return _cast_boundaries(surfaces, edge[target], image, reflects=depth > 0)
+
+        where = source[None], y + surfaces.origin
+        paths = find_paths_along(surfaces, sequences, *where, is_needed)
         hits: dict[int, list[tuple[_RaysPastEdges, Tensor]]] = {}
         for part in paths:
             part = replace(part, source=part.source + number)
@@ -226,30 +238,48 @@ def sample_illumination_boundaries(
     return found
 
 
-def _casting_edges(surfaces: CandidateSurfaces, source: Tensor | None) -> Int64[Tensor, " edge"]:
-    """Return edges that can cast a boundary: where surfaces fold, on direct paths silhouettes.
+def _find_folds(surfaces: CandidateSurfaces) -> Int64[Tensor, " edge"]:
+    """Return the edges where surfaces end or leave their plane."""
+    # Coplanar triangles of one object are one surface; the table is as wide as any edge needs.
+    is_there, faces = _edge_triangles(surfaces.topology)
+    plane = surfaces.planes.face_plane[faces]
+    return torch.nonzero((is_there & (plane != plane[:, :1])).any(1) | ~is_there[:, 1])[:, 0]
+
+
+def _cast_boundaries(
+    surfaces: CandidateSurfaces,
+    edges: Int64[Tensor, " row"],
+    image: Float64[Tensor, "row 3"],
+    *,
+    reflects: bool,
+) -> Bool[Tensor, " row"]:
+    """Mask of edges that can cast a boundary: silhouettes, and those of surfaces that light leaves.
 
     Args:
         surfaces: surfaces of the scene.
-        source: transmitter position in world axes [m]; None = paths with interactions count, too.
+        edges: numbers of edges.
+        image: image of the transmitter that each is seen from, relative to the local origin [m].
+        reflects: True where paths may reflect after the edge.
     """
-    topology, planes = surfaces.topology, surfaces.planes.face_plane
-    # Coplanar triangles of one object are one surface; the table is as wide as any edge needs.
-    is_there, faces = topology.edge_faces >= 0, topology.edge_faces.clamp_min(0)
-    plane = planes[faces]
-    casts = (is_there & (plane != plane[:, :1])).any(1) | ~is_there[:, 1]
-    if source is not None:
-        y0, y1 = surfaces.exact_vertices[topology.edges].unbind(1)
-        apex = surfaces.exact_vertices[topology.edge_apexes.clamp_min(0)] - y0[:, None]
-        height = dot(apex, cross(y0 - (source - surfaces.origin), y1 - y0)[:, None])
-        height = torch.where(is_there, height, 0.0)
-        tolerance = _ON_ONE_SIDE * height.abs().amax(1)
-        casts &= (
-            (height.amin(1) >= -tolerance)
-            | (height.amax(1) <= tolerance)
-            | (is_there & surfaces.interactions.transmit[faces]).any(1)
-        )
-    return torch.nonzero(casts)[:, 0]
+    topology, own = surfaces.topology, surfaces.interactions
+    is_there, faces = _edge_triangles(topology, edges)
+    y0, y1 = surfaces.exact_vertices[topology.edges[edges]].unbind(1)
+    apex = surfaces.exact_vertices[topology.edge_apexes[edges].clamp_min(0)] - y0[:, None]
+    height = dot(apex, cross(y0 - image, y1 - y0)[:, None])
+    height = torch.where(is_there, height, 0.0)
+    tolerance = _ON_ONE_SIDE * height.abs().amax(1)
+    leaves = own.transmit[faces] | own.reflect[faces] if reflects else own.transmit[faces]
+    return (
+        (height.amin(1) >= -tolerance) | (height.amax(1) <= tolerance) | (is_there & leaves).any(1)
+    )
+
+
+def _edge_triangles(
+    topology: Topology, edges: Tensor | slice = slice(None)
+) -> tuple[Bool[Tensor, "row k"], Int64[Tensor, "row k"]]:
+    """Return a mask of the triangles at edges that there are, and their numbers, else 0."""
+    faces = topology.edge_faces[edges]
+    return faces >= 0, faces.clamp_min(0)
 
 
 def sample_along_curves(

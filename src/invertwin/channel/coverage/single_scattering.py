@@ -261,6 +261,7 @@ class SingleScatteringTracer:
             vertices = strip_derivatives(geometry.vertices)
             samples = self.sample_points(replace(geometry, vertices=vertices))
         recompute = any(t.requires_grad for t in (stage.vertices, stage.tx, stage.rx))
+        recompute &= len(samples.antenna) > POINTS_AT_ONCE
         total: Tensor | float = 0.0
         for rows in torch.arange(len(samples.antenna)).split(POINTS_AT_ONCE):
             part = samples.select(rows)

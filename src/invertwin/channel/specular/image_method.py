@@ -11,7 +11,7 @@ Source: derivations §10.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -27,11 +27,13 @@ from invertwin.channel.rays import arrays
 from invertwin.channel.rays.backend import dr, mi
 from invertwin.channel.rays.ray_scene import MAX_SHEETS, RAY_EPSILON, Occluders
 from invertwin.channel.rays.topology import Topology
+from invertwin.channel.rays.triangle_spheres import TriangleSpheres
 from invertwin.channel.rows import Rows, bound_groups
 
 _StepNumbers = Int64[Tensor, "row step"]
 _StepVectors = Float64[Tensor, "row step 3"]
 PathVectors: TypeAlias = Float64[Tensor, "row 3"]  # one for each path
+_PathFilter = Callable[[PathVectors, _StepNumbers, Int64[Tensor, " row"]], Bool[Tensor, " row"]]
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
 DIRECT = torch.zeros(1, 0, dtype=torch.int64)
 """The sequence without steps, of the line of sight."""
@@ -86,6 +88,11 @@ class CandidateSurfaces(Occluders):
         tables = {name: arrays.to_double(getattr(self.planes, name)) for name in names}
         sheets, planes = self.interactions.transmit, self.planes.face_plane.clamp_min(0)
         return tables | {"is_sheet": arrays.to_index(sheets), "of_face": arrays.to_index(planes)}
+
+    @cached_property
+    def triangle_spheres(self) -> TriangleSpheres:
+        """Bounding spheres of the triangles."""
+        return TriangleSpheres(self.exact_vertices[self.topology.faces], self.margin)
 
     @cached_property
     def device_rim_widths(self) -> Any:
@@ -235,6 +242,7 @@ def find_paths_along(
     sequences: Sequence[Int64[Tensor, "_ _"]],
     sources: Float64[Tensor, "source 3"],
     targets: Float64[Tensor, "target 3"],
+    is_needed: _PathFilter | None = None,
 ) -> list[SpecularPaths]:
     """Find the paths from all sources to all targets: direct, and along given sequences.
 
@@ -242,11 +250,14 @@ def find_paths_along(
         surfaces: candidate surfaces of the scene.
         sequences: sequences by length, as ``steps`` of ``find_paths_from``.
         sources, targets: positions in world axes [m].
+        is_needed: as of ``find_paths_from``.
     """
     own, found = torch.zeros(len(targets), dtype=torch.int64), []
     for steps in (DIRECT, *sequences):
         for number, source in enumerate(sources) if len(steps) else ():
-            for some in find_paths_from(surfaces, steps, source[None], own, targets):
+            for some in find_paths_from(
+                surfaces, steps, source[None], own, targets, is_needed=is_needed
+            ):
                 found.append(replace(some, source=torch.full_like(some.source, number)))
     return found
 
@@ -258,6 +269,7 @@ def find_paths_from(
     source_index: Int64[Tensor, " target"],
     targets: Float64[Tensor, "target 3"],
     target_planes: Int64[Tensor, " target"] | None = None,
+    is_needed: _PathFilter | None = None,
 ) -> list[SpecularPaths]:
     """Find the paths that follow given sequences to each target from its own source.
 
@@ -267,6 +279,8 @@ def find_paths_from(
         sources, targets: positions in world axes [m].
         source_index: number of the source of each target.
         target_planes: plane that each target lies in, −1 = none; None = none for all.
+        is_needed: mask of the paths to test for obstructions, by their sources, the planes of their
+            reflections and the numbers of their targets; None = all.
     """
     found: list[SpecularPaths] = []
     for part in steps.split(max(1, _LANES // len(sources))):
@@ -277,6 +291,9 @@ def find_paths_from(
             target, sequence = screen.select_candidates(targets[rows], source_index[rows])
             target = target + begin
             chosen, source = part[sequence], source_index[target]
+            if is_needed is not None:
+                rows = is_needed(sources[source], chosen, target)
+                chosen, source, target = chosen[rows], source[rows], target[rows]
             plane = None if target_planes is None else target_planes[target]
             ends = sources[source], targets[target]
             valid, faces, transmitted = find_unobstructed_paths(surfaces, chosen, *ends, plane)
@@ -578,8 +595,7 @@ def _test_exactly(
     """
     own, corners = surfaces.planes.face_plane, surfaces.exact_vertices[surfaces.topology.faces]
     a, b, c = corners.unbind(1)
-    area, center = waves.cross(b - a, c - a), (a + b + c) / 3
-    radius = (corners - center[:, None]).norm(dim=2).amax(1) + surfaces.margin
+    area = waves.cross(b - a, c - a)
     valid = torch.ones(len(segments.start), dtype=torch.bool)
     hit_faces, least = torch.full((len(valid),), -1), torch.full((len(valid),), -torch.inf).double()
     passed = torch.full((len(valid), width), -1)
@@ -587,10 +603,7 @@ def _test_exactly(
     # Points of seams lie in their surfaces to within rounding only; rays end before them, too.
     gap = torch.where(segments.plane.maximum(segments.target_plane) < 0, surfaces.margin, tolerance)
     for rows in torch.arange(len(valid)).split(max(1, _MAX_PAIRS // len(a))):
-        unit = normalize(segments.end[rows] - segments.start[rows], dim=1)
-        along = unit @ center.T - waves.dot(unit, segments.start[rows])[:, None]
-        square = torch.cdist(segments.start[rows], center).square() - along.square()
-        near, face = torch.nonzero(square <= radius.square(), as_tuple=True)
+        near, face = surfaces.triangle_spheres.find_close(segments.start[rows], segments.end[rows])
         row = rows[near]
         start, end = segments.start[row], segments.end[row]
         length, slope = (end - start).norm(dim=1), waves.dot(end - start, area[face])
