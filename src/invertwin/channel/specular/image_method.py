@@ -10,7 +10,6 @@ by four slightly shifted rays, and where they disagree, a float64 test over all 
 Source: derivations §10.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -37,7 +36,7 @@ _PathFilter = Callable[[PathVectors, _StepNumbers, Int64[Tensor, " row"]], Bool[
 _PLANE_TOLERANCE = 1e-5  # rad, and fraction of the scene's size: equal planes
 DIRECT = torch.zeros(1, 0, dtype=torch.int64)
 """The sequence without steps, of the line of sight."""
-_LANES = 1 << 19
+_LANES = 1 << 17
 _MAX_PAIRS = 1 << 22  # segments × triangles per chunk of the exact test
 _RAY_SPREAD = 4.0  # margins between the rays that test a segment
 _EXACT_TOLERANCE = 1e-9  # of the scene's size: float64 points closer than this coincide
@@ -510,23 +509,23 @@ def _test_segments(
     surfaces: CandidateSurfaces, segments: _SpecularSegments
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Triangle at the end of each segment, mask of unobstructed segments, and the sheets passed."""
-    unit = normalize(segments.end - segments.start, dim=1)
+    count = len(segments.start)
+    four = segments.select(torch.arange(count).repeat(4))  # rays in one launch
+    unit = normalize(four.end - four.start, dim=1)
     first = waves.orthogonal_unit_vectors(unit)
-    second = waves.cross(unit, first)
-    votes = torch.zeros(len(unit), dtype=torch.int64)
-    end_plane = segments.plane.maximum(segments.target_plane)
-    faces = passed = previous = votes
-    agree = torch.ones_like(votes, dtype=torch.bool)
-    for number in range(4):
-        spread = _RAY_SPREAD * surfaces.margin * (number < 3)  # the last ray is not shifted
-        offset = spread * (math.cos(2.1 * number) * first + math.sin(2.1 * number) * second)
-        start = segments.start + _shift_in_plane(surfaces, offset, unit, segments.plane_before)
-        end = segments.end + _shift_in_plane(surfaces, offset, unit, end_plane)
-        faces, passed = _cast_rays(surfaces, start, end, segments)
-        votes += torch.where(segments.plane >= 0, faces >= 0, faces == -1)
-        planes = surfaces.planes.face_plane[passed].where(passed >= 0, -1)
-        agree &= (planes == (previous if number else planes)).all(1)
-        previous = planes
+    number = torch.arange(4, dtype=torch.float64).repeat_interleave(count)[:, None]
+    offset = torch.cos(2.1 * number) * first + torch.sin(2.1 * number) * waves.cross(unit, first)
+    offset = offset * (_RAY_SPREAD * surfaces.margin * (number < 3))  # the last one is not shifted
+    start = four.start + _shift_in_plane(surfaces, offset, unit, four.plane_before)
+    end_plane = four.plane.maximum(four.target_plane)
+    end = four.end + _shift_in_plane(surfaces, offset, unit, end_plane)
+    faces, passed = (
+        found.unflatten(0, (4, count)) for found in _cast_rays(surfaces, start, end, four)
+    )
+    votes = torch.where(segments.plane >= 0, faces >= 0, faces == -1).sum(0)
+    planes = surfaces.planes.face_plane[passed].where(passed >= 0, -1)
+    agree = (planes == planes[:1]).all(2).all(0)
+    faces, passed = faces[-1], passed[-1]
     undecided = torch.nonzero((votes > 0) & ~((votes == 4) & agree))[:, 0]
     valid = votes == 4
     if len(undecided):
