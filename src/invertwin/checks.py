@@ -55,19 +55,22 @@ def checked_tensor(
     return tensor
 
 
-def to_tensor(value: object, what: str, do: str) -> Tensor:
-    """Convert a value to a float64 tensor of any shape; gradients are kept.
+def to_tensor(
+    value: object, what: str, do: str, dtype: torch.dtype | None = torch.float64
+) -> Tensor:
+    """Convert a value to a tensor of any shape; gradients are kept.
 
     Args:
         value: tensor, array or nested sequence of numbers.
         what: noun for the value, for the message.
         do: remedy, for the message.
+        dtype: type of the numbers; None = that of the value.
 
     Raises:
         InputError: not numbers.
     """
     try:
-        return torch.as_tensor(value, dtype=torch.float64)
+        return torch.as_tensor(value, dtype=dtype)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"expected {what}, got {type(value).__name__}; {do}") from None
 
@@ -121,6 +124,40 @@ def check_some(values: Sized, what: str, do: str) -> None:
         raise InputError(f"expected at least one {what}, got none; {do}")
 
 
+def checked_point(
+    value: object, what: str, do: str = "give x, y, z", most: float = MAX_NUMBER
+) -> Tensor:
+    """Convert a point or a direction to three finite numbers [3]; gradients are kept.
+
+    Args:
+        value: the numbers.
+        what: noun for them, for the message.
+        do: remedy, for the message.
+        most: greatest magnitude.
+
+    Raises:
+        InputError: wrong shape, NaN, infinite or too large.
+    """
+    return checked_tensor(value, (3,), what, do, most)
+
+
+def checked_positions(value: object, what: str, one: str, do: str) -> Tensor:
+    """Convert positions to finite rows [position, 3], at least one; gradients are kept.
+
+    Args:
+        value: numbers [position, 3] in metres.
+        what: noun for the positions, for the message.
+        one: what has a position each, for the message.
+        do: remedy, for the message.
+
+    Raises:
+        InputError: wrong shape, NaN, infinite or too large, or no position.
+    """
+    rows = checked_tensor(value, (None, 3), what, do, MAX_LENGTH)
+    check_some(rows, one, do)
+    return rows
+
+
 def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> Tensor:
     """Convert one point or several to finite rows [point, 3], at least one; gradients are kept.
 
@@ -134,9 +171,7 @@ def checked_rows(value: object, what: str, do: str = "give x, y, z of each") -> 
     """
     rows = to_tensor(value, f"{what} as numbers", do)
     rows = rows[None] if rows.ndim == 1 else rows
-    rows = checked_tensor(rows, (None, 3), what, do, MAX_LENGTH)
-    check_some(rows, f"row of {what}", do)
-    return rows
+    return checked_positions(rows, what, f"row of {what}", do)
 
 
 def checked_ascending(value: object, what: str, do: str, least: int = 2) -> Tensor:
@@ -279,6 +314,17 @@ def check_fields(holder: object) -> None:
                 _check_number(holder, name, number, found)
         else:
             check_choice(value, allowed, f"{name} to be one of", "choose one of them")
+
+
+class CheckedFields:
+    """Base class of dataclasses whose fields keep to the limits in their annotations.
+
+    Raises:
+        InputError: a value beyond its limits, see ``check_fields``.
+    """
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @cache

@@ -33,6 +33,22 @@ class PhysicsWarning(UserWarning):
     """The input is valid, but its result will not mean what one may expect."""
 
 
+@contextmanager
+def prefix_errors(where: str) -> Iterator[None]:
+    """Put the place of a fault before the text of an InputError.
+
+    Args:
+        where: The place, such as the path of a file.
+
+    Raises:
+        InputError: The block has raised one.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
 def import_optional(package: str, extra: str) -> Any:
     """Import a package that comes with an extra only.
 

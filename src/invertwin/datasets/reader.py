@@ -72,9 +72,8 @@ class SampleDataset(Dataset[Any]):
         if number not in self._places:
             self._places[number] = locate_members(path)
         sample = shard.first + index - int(self._starts[number])
-        with convert_read_errors(
-            path, "a whole shard of a data set", "check() says which are damaged"
-        ):
+        do = "check() says which are damaged"
+        with convert_read_errors(path, "a whole shard of a data set", do):
             found = self._read(path, sample, self._places[number][sample])
         return found if self._transform is None else self._transform(found)
 

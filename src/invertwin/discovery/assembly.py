@@ -9,20 +9,13 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from invertwin import inversion
 from invertwin.channel import Grid, Sampling
 from invertwin.discovery.imaging.likelihood import HeavyTailedLoss
 from invertwin.discovery.imaging.reflectivity import thin_map
 from invertwin.discovery.memory import SearchMemory
 from invertwin.discovery.shapes.primitives import PrimitiveModel, ShapeParameters, Shapes
 from invertwin.discovery.shapes.prisms import OutlineModel, make_shape_model
-from invertwin.inversion import (
-    Observation,
-    Optimizer,
-    Reconstruction,
-    Report,
-    Schedule,
-    reconstruct,
-)
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar import Radar
 from invertwin.runtime.progress import track
@@ -180,19 +173,22 @@ class ShapeLikelihood:
         model, radar = replace(self.model, sampling=fewer), self.radar.frames(chosen)
         return replace(self, model=model, radar=radar, power=self.power[chosen])
 
-    def fit(self, shapes: Shapes, steps: int) -> tuple[list[ShapeParameters], Reconstruction]:
+    def fit(
+        self, shapes: Shapes, steps: int
+    ) -> tuple[list[ShapeParameters], inversion.Reconstruction]:
         """Fit all numbers of the shapes jointly.
 
         Args:
             shapes: initial shape parameters.
             steps: number of steps.
         """
-        scene, adam = self.build_scene(shapes), Optimizer("adam", rate=_LEARNING_RATE)
-        free, data = self.unknowns(shapes), Observation(self.model, self.power, sensor=self.radar)
-        plan, loss, seed = Schedule(steps, annealing=0.5), self.loss, self.seed
+        scene, adam = self.build_scene(shapes), inversion.Optimizer("adam", rate=_LEARNING_RATE)
+        free = self.unknowns(shapes)
+        data = inversion.Observation(self.model, self.power, sensor=self.radar)
+        plan, loss, seed = inversion.Schedule(steps, annealing=0.5), self.loss, self.seed
         done = track(range(steps + 1), f"steps of a fit of {len(shapes)} objects")
-        hooks = [Report(lambda _: (self.memory.heed(), next(done, None)))]
-        found = reconstruct(
+        hooks = [inversion.Report(lambda _: (self.memory.heed(), next(done, None)))]
+        found = inversion.reconstruct(
             scene, data, free, loss=loss, optimizer=adam, schedule=plan, seed=seed, callbacks=hooks
         )
         return [one.shape for one in free.values()], found

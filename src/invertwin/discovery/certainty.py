@@ -35,10 +35,7 @@ def standard_deviations(
     mean = (mean.detach().clamp_min(0.0) + likelihood.loss.level.to(mean)[:, None, None]).double()
     ratio, nu = power.double() / mean, likelihood.loss.degrees
     score = 1 - ratio * speckle_weight(ratio, nu)
-    first, second = (
-        map_derivatives(fit, rows, number)[0].detach().double() / mean for number in (0, 1)
-    )
-    flat = [part.flatten(2) for part in (first, second)]
+    flat = [(map_derivatives(fit, rows, k)[0].detach().double() / mean).flatten(2) for k in (0, 1)]
     # The product of two independent draws is free of the apparent information of their noise.
     mixed = torch.einsum("pfn,qfn->pq", *flat)
     information = nu / (nu + 2) * 0.5 * (mixed + mixed.T) / likelihood.bins_per_draw

@@ -221,9 +221,8 @@ def detect_strongest_target(
     bins = model.bins / chirps.count, radar.waveform.range_resolution / grid.range_step
     near = max(1, round(_CFAR_CELLS * bins[0])), max(1, round(_CFAR_CELLS * bins[1]))
     power = model.observe(recording).detach()
-    seen = ordered_statistics_cfar(
-        power.amax((-2, -1)), guard=near, training=near, false_alarm=_FALSE_ALARM_RATE
-    )
+    cells = power.amax((-2, -1))
+    seen = ordered_statistics_cfar(cells, guard=near, training=near, false_alarm=_FALSE_ALARM_RATE)
     points = point_cloud(power, seen, radar, grid, chirps)
     strength = points.power
     if box is not None:

@@ -301,9 +301,8 @@ def _is_moving(point: DetectedObject, moving: Sequence[DetectedObject]) -> bool:
 
 def _sort_objects(things: list[DetectedObject]) -> tuple[DetectedObject, ...]:
     """Sort objects by existence probability, moving ones last."""
-    return tuple(
-        sorted(things, key=lambda one: (one.velocity is not None, -one.existence_probability))
-    )
+    things = sorted(things, key=lambda one: (one.velocity is not None, -one.existence_probability))
+    return tuple(things)
 
 
 def _search_range(capture: Capture, range_max: float | None) -> tuple[float, float] | str:

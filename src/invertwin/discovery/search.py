@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, islice, product
+from operator import is_not
 
 import torch
 from jaxtyping import Float64
@@ -161,9 +162,8 @@ class ShapeSearch:
         strength = self.residual_image(shapes) if shapes else self.first_image
         # Skip groups that the residual image does not distinguish from speckle.
         weight = proposals.bright_weights(strength)
-        parts = proposals.group_bright_points(
-            self.image_grid.positions, weight, 3.5 * self.image_grid.step
-        )
+        grid = self.image_grid
+        parts = proposals.group_bright_points(grid.positions, weight, 3.5 * grid.step)
         total = float(strength.sum())
         parts = [part for part in parts if float(part.sum()) > _MIN_GROUP_FRACTION * total]
         known, born = list(shapes), list[tuple[Tensor, ShapeParameters]]()
@@ -429,9 +429,8 @@ def propose_kinds(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Shap
         likelihood: likelihood that selects the heading of a shape.
         shapes: present shapes.
     """
-    found = [
-        [convert_kind(shape, kind) for shape in shapes] for kind in ("box", "cylinder", "sphere")
-    ]
+    plain = ("box", "cylinder", "sphere")
+    found = [[convert_kind(shape, kind) for shape in shapes] for kind in plain]
     for kind in ("person", "vehicle", "corner"):
         changed = list(shapes)
         for number, shape in enumerate(shapes):
@@ -441,9 +440,7 @@ def propose_kinds(likelihood: ShapeLikelihood, shapes: Shapes) -> list[list[Shap
                 gains = [likelihood.total_gain([*rest, option]) for option in options]
                 changed[number] = options[gains.index(max(gains))]
         found.append(changed)
-    return [
-        rows for rows in found if any(new is not old for new, old in zip(rows, shapes, strict=True))
-    ]
+    return [rows for rows in found if any(map(is_not, rows, shapes))]
 
 
 def rotate_headed_shapes(shapes: Shapes, rotation: float) -> list[ShapeParameters]:

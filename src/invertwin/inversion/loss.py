@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.checks import check_fields, check_shape
+from invertwin.checks import CheckedFields, check_fields, check_shape
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
 from invertwin.limits import Count, Positive
@@ -427,7 +427,7 @@ CorrelationScale = Literal["magnitude", "power", "level"]
 
 
 @dataclass(frozen=True)
-class CorrelationLoss:
+class CorrelationLoss(CheckedFields):
     """One minus Pearson's correlation of two power maps; no gain or offset changes it.
 
     Attributes:
@@ -439,9 +439,6 @@ class CorrelationLoss:
     """
 
     scale: CorrelationScale = "magnitude"
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def __call__(self, simulated: _Bins, measured: _Bins) -> Float64[Tensor, ""]:
         """Return the loss: 0 for proportional maps, 1 for uncorrelated ones.

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from invertwin.checks import checked_type
+from invertwin.checks import checked_type, set_fields
 from invertwin.deprecation import warn_renamed
 from invertwin.errors import InputError
 from invertwin.forward_model import ForwardModel
@@ -112,8 +112,7 @@ class Observation:
         if not weight > 0:
             raise InputError(f"expected a weight > 0, got {weight}; leave the observation out")
         values = (model, data, sensor, weight, parameters, loss)
-        for name, value in zip(self.__dataclass_fields__, values, strict=True):
-            object.__setattr__(self, name, value)
+        set_fields(self, **dict(zip(self.__dataclass_fields__, values, strict=True)))
 
     def observed_map(self) -> Tensor:
         """Return the data in the form of the model's maps."""

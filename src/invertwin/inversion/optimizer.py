@@ -9,7 +9,7 @@ import torch
 from annotated_types import Ge, Lt
 from torch import nn
 
-from invertwin.checks import check_fields
+from invertwin.checks import CheckedFields
 from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.loss import Objective
 from invertwin.limits import Count, NonNegative, Positive
@@ -18,7 +18,7 @@ _ANGLES = ("rotation", "yaw", "spread")  # how parameters that are angles are na
 
 
 @dataclass(frozen=True)
-class Optimizer:
+class Optimizer(CheckedFields):
     """Kind of optimiser and its learning rates.
 
     Attributes:
@@ -40,9 +40,6 @@ class Optimizer:
     final_rate: NonNegative | None = None
     momentum: Annotated[float, Ge(0), Lt(1)] = 0.9
     curvature_every: Count = 1
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def build(
         self,

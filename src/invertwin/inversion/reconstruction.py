@@ -238,9 +238,8 @@ class _FreeParameters:
 
     def __init__(self, groups: Sequence[Mapping[str, nn.Module]]) -> None:
         self._modules = {name: module for group in groups for name, module in group.items()}
-        self._first = {
-            p: p.requires_grad for module in self._modules.values() for p in module.parameters()
-        }
+        every = nn.ModuleList(self._modules.values()).parameters()
+        self._first = {parameter: parameter.requires_grad for parameter in every}
 
     def apply(self, stage: Stage) -> None:
         """Free the unknowns of a stage, and freeze the others."""

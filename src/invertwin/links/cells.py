@@ -34,7 +34,7 @@ _FaceNumbers = Int64[Tensor, " row"]
 
 
 @dataclass(frozen=True)
-class CellSampling:
+class CellSampling(checks.CheckedFields):
     """Numbers of sample points in the cells of a map.
 
     Attributes:
@@ -50,9 +50,6 @@ class CellSampling:
     points: Count = 16
     edge_points: Count = 20_000
     boundary: bool = True
-
-    def __post_init__(self) -> None:
-        checks.check_fields(self)
 
     @property
     def points_per_side(self) -> int:
@@ -179,8 +176,7 @@ class MapPlane(Cells):
 
     def __post_init__(self) -> None:
         for name in ("corner", "first", "second"):
-            what = f"{name} of a map [m]"
-            value = checks.checked_tensor(getattr(self, name), (3,), what, "give x, y, z")
+            value = checks.checked_point(getattr(self, name), f"{name} of a map [m]")
             checks.set_fields(self, **{name: checks.strip_derivatives(value)})
         if not float(self._normal.norm()) > 0:
             raise InputError(
@@ -296,9 +292,8 @@ class MapMesh(Cells):
     sampling: CellSampling = CellSampling()
 
     def __post_init__(self) -> None:
-        checks.set_fields(
-            self, mesh=replace(self.mesh, vertices=checks.strip_derivatives(self.mesh.vertices))
-        )
+        vertices = checks.strip_derivatives(self.mesh.vertices)
+        checks.set_fields(self, mesh=replace(self.mesh, vertices=vertices))
         if not bool((self.areas > 0).all()):
             raise InputError(
                 "expected triangles with an area for the cells of a map, got one without; remove it"

@@ -10,12 +10,8 @@ from invertwin.channel import KINDS, RayPaths
 from invertwin.errors import InputError
 
 # What Sionna calls reflection, refraction, and diffraction; 2 is diffuse reflection.
-_KINDS = {
-    0: 0,
-    1: KINDS.index("reflection"),
-    4: KINDS.index("transmission"),
-    8: KINDS.index("diffraction"),
-}
+_NAMES = {1: "reflection", 4: "transmission", 8: "diffraction"}
+_KINDS = {0: 0} | {number: KINDS.index(name) for number, name in _NAMES.items()}
 
 
 def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
@@ -62,9 +58,8 @@ def ray_paths_from_sionna(paths: Any, frequency: float) -> RayPaths:
     sources, targets, field, vertices, kinds = (torch.from_numpy(array) for array in arrays)
     columns = sources, targets, delay, field, departure, arrival, vertices, kinds
     where = unknown_surface, unknown_surface, (), doppler
-    return RayPaths(
-        (valid.shape[1], valid.shape[0]), float(frequency), *columns, *where
-    ).sort_rows()
+    counts = valid.shape[1], valid.shape[0]
+    return RayPaths(counts, float(frequency), *columns, *where).sort_rows()
 
 
 def _rows(values: Any, valid: np.ndarray) -> Tensor:

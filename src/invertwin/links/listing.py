@@ -5,9 +5,8 @@ import math
 import torch
 
 from invertwin.channel import KINDS, RayPaths
-from invertwin.links.responses import AntennaMount, path_amplitudes
+from invertwin.links.responses import DEFAULT_MOUNT, AntennaMount, path_amplitudes
 
-_DEFAULT = AntennaMount()
 _HEADER = (
     f"{'path':>4} {'delay ns':>10} {'length m':>10} {'power dB':>9} {'departs az, el':>16} "
     f"{'arrives az, el':>16} {'Doppler Hz':>11}  what it meets"
@@ -17,8 +16,8 @@ _HEADER = (
 def path_table(
     paths: RayPaths,
     link: tuple[int, int] = (0, 0),
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = DEFAULT_MOUNT,
+    rx: AntennaMount = DEFAULT_MOUNT,
 ) -> str:
     """Format the paths of one link as text, shortest first.
 

@@ -7,8 +7,7 @@ from typing import ClassVar
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.checks import check_some, checked_tensor, set_fields
-from invertwin.limits import MAX_LENGTH
+from invertwin.checks import checked_positions, set_fields
 from invertwin.links.received import LinkStatistics, PropagationSettings
 from invertwin.links.transmitters import Transmitters
 from invertwin.scene.scene import Scene
@@ -69,8 +68,7 @@ class ReceiverPoints(ReceiverLocations):
 
     def __post_init__(self) -> None:
         do = "give a row of x, y, z for each"
-        places = checked_tensor(self.positions, (None, 3), "receiver positions", do, MAX_LENGTH)
-        check_some(places, "point of a map", do)
+        places = checked_positions(self.positions, "receiver positions", "point of a map", do)
         set_fields(self, positions=places)
 
     @property

@@ -28,8 +28,9 @@ from invertwin.links import responses
 from invertwin.links.metasurface.panel import Metasurface, panel_paths
 from invertwin.links.responses import AntennaMount, path_amplitudes, phasor, sum_over_paths
 from invertwin.links.scattered import scattered_moments
-from invertwin.links.spreads import path_powers, safe_sqrt
+from invertwin.links.spreads import path_powers
 from invertwin.links.transmitters import Transmitters
+from invertwin.scene.material.fresnel import safe_root
 from invertwin.scene.scene import Scene
 
 _Receivers = Float64[Tensor, "rx 3"]
@@ -37,7 +38,6 @@ _Senders = Float64[Tensor, "tx 3"]
 _RECEIVERS_PER_BATCH = 512
 _VALUES_PER_CHUNK = 1 << 21
 _MAX_NODES = 1000  # Gauss's rule of more takes long to find
-_DEFAULT = AntennaMount()
 _gauss_nodes = cache(leggauss)
 
 
@@ -255,7 +255,7 @@ def delay_spread_from_moments(moments: Float64[Tensor, "*link 3"]) -> Float64[Te
     """
     power, first, second = moments.unbind(-1)
     safe = torch.where(power > 0, power, 1.0)
-    return safe_sqrt(second / safe - (first / safe) ** 2)
+    return safe_root(second / safe - (first / safe) ** 2, 0.0)
 
 
 def evaluate_in_batches(
@@ -281,8 +281,8 @@ def evaluate_in_batches(
 def received_gain(
     paths: RayPaths,
     bandwidth: float | None = None,
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = responses.DEFAULT_MOUNT,
+    rx: AntennaMount = responses.DEFAULT_MOUNT,
 ) -> Float64[Tensor, "rx tx"]:
     """Ratio of received to transmitted power of every link; 0 without a path.
 

@@ -141,11 +141,11 @@ class AntennaMount:
         return rotations[index]
 
 
-_DEFAULT = AntennaMount()
+DEFAULT_MOUNT = AntennaMount()
 
 
 def path_amplitudes(
-    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = DEFAULT_MOUNT, rx: AntennaMount = DEFAULT_MOUNT
 ) -> tuple[Complex128[Tensor, "path rx_ant tx_ant"], Float64[Tensor, "path rx_ant tx_ant"]]:
     """Compute coefficient and delay [s] of every path between every pair of elements.
 
@@ -187,8 +187,8 @@ def frequency_response(
     paths: RayPaths,
     frequencies: checks.ArrayLike,
     *,
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = DEFAULT_MOUNT,
+    rx: AntennaMount = DEFAULT_MOUNT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant frequency"]:
     """Frequency response H(f) = Σ a exp(−j2πfτ) between all elements; zero without a path.
 
@@ -221,8 +221,8 @@ def ofdm_channel(
     spacing: float,
     symbols: int = 1,
     cyclic_prefix: float = 0.0,
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = DEFAULT_MOUNT,
+    rx: AntennaMount = DEFAULT_MOUNT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant symbol subcarrier"]:
     """Channel coefficients of every OFDM symbol and subcarrier.
 
@@ -260,8 +260,8 @@ def impulse_response(
     bandwidth: float,
     taps: int,
     start: float = 0.0,
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = DEFAULT_MOUNT,
+    rx: AntennaMount = DEFAULT_MOUNT,
 ) -> Complex128[Tensor, "rx rx_ant tx tx_ant tap"]:
     """Impulse response in a band about the carrier: h_n = Σ a exp(−j2πf₀τ) sinc(B(τ − t_n)).
 

@@ -40,8 +40,8 @@ class Reverberation:
     def __post_init__(self) -> None:
         checked_number(self.gain_db, "gain of the tail [dB]", -300.0, 300.0)
         checked_number(self.decay, "decay of the tail [s]", 0.0, 1.0, open_low=True)
-        values = (to_tensor(v, "a tail", "give numbers") for v in (self.gain_db, self.decay))
-        set_fields(self, **dict(zip(("gain_db", "decay"), values, strict=True)))
+        given = vars(self).items()
+        set_fields(self, **{name: to_tensor(v, "a tail", "give numbers") for name, v in given})
 
     def link_moments(
         self, tx: Float64[Tensor, "tx 3"], rx: Float64[Tensor, "place 3"]

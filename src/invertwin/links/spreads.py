@@ -8,13 +8,12 @@ from torch import Tensor
 
 from invertwin.channel import KINDS, RayPaths
 from invertwin.checks import check_choice
-from invertwin.links.responses import AntennaMount, path_amplitudes, sum_over_paths
-
-_DEFAULT = AntennaMount()
+from invertwin.links.responses import DEFAULT_MOUNT, AntennaMount, path_amplitudes, sum_over_paths
+from invertwin.scene.material.fresnel import safe_root
 
 
 def delay_spread(
-    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = DEFAULT_MOUNT, rx: AntennaMount = DEFAULT_MOUNT
 ) -> Float64[Tensor, "rx tx"]:
     """Root-mean-square delay spread, weighted by power [s]; 0 for links of at most one path.
 
@@ -29,8 +28,8 @@ def delay_spread(
 def angle_spread(
     paths: RayPaths,
     end: Literal["departure", "arrival"] = "arrival",
-    tx: AntennaMount = _DEFAULT,
-    rx: AntennaMount = _DEFAULT,
+    tx: AntennaMount = DEFAULT_MOUNT,
+    rx: AntennaMount = DEFAULT_MOUNT,
 ) -> Float64[Tensor, "rx tx"]:
     """Angular spread √(1 − |u|²), with u the mean unit vector weighted by power.
 
@@ -60,11 +59,11 @@ def _spread(paths: RayPaths, values: Tensor, tx: AntennaMount, rx: AntennaMount)
     mean = torch.stack([_sum_links(paths, power * x) for x in values.unbind(1)], -1)
     mean = mean / total[..., None]
     offset = (values - mean[paths.rx, paths.tx]).square().sum(1)
-    return safe_sqrt(_sum_links(paths, power * offset) / total)
+    return safe_root(_sum_links(paths, power * offset) / total, 0.0)
 
 
 def rician_factor(
-    paths: RayPaths, tx: AntennaMount = _DEFAULT, rx: AntennaMount = _DEFAULT
+    paths: RayPaths, tx: AntennaMount = DEFAULT_MOUNT, rx: AntennaMount = DEFAULT_MOUNT
 ) -> Float64[Tensor, "rx tx"]:
     """Power ratio of the straight path, also through sheets, to all other paths.
 
@@ -101,13 +100,3 @@ def _sum_links(paths: RayPaths, values: Tensor) -> Tensor:
 
 def _nonzero(total: Tensor) -> Tensor:
     return torch.where(total > 0, total, 1.0)
-
-
-def safe_sqrt(square: Tensor) -> Tensor:
-    """Square root with a finite derivative at zero.
-
-    Args:
-        square: Values; negative values are treated as zero.
-    """
-    some = square > 0
-    return torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)

@@ -14,6 +14,7 @@ from invertwin.links.responses import AntennaMount
 from invertwin.links.reverberation import NEPERS_PER_DB, Reverberation
 from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
+from invertwin.scene.shape_models.lattice import Lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +141,15 @@ class TransmitterPosition(nn.Module):
         scene: Scene | None = None,
     ) -> None:
         super().__init__()
-        do = "give x, y, z"
-        begun = checked_tensor(initial, (3,), "initial place of a transmitter [m]", do)
-        begun = begun.detach().clone()
+        what, do = "initial place of a transmitter [m]", "give x, y, z"
+        begun = checked_tensor(initial, (3,), what, do).detach().clone()
         self._axes, self._number = axes_mask(axes), number
         if (low is None) != (high is None):
             raise InputError("expected both corners of the box, got one; give low and high")
         self._box = None
         if low is not None and high is not None:
-            ends = (
-                checked_tensor(corner, (3,), f"{name} corner of the box [m]", do)
-                for name, corner in (("low", low), ("high", high))
-            )
-            self._box = torch.stack([*ends])
+            box = Lattice.from_bounds(low, high, (2, 2, 2))
+            self._box = torch.stack([box.low, box.high])
             if not bool(((begun > self._box[0]) & (begun < self._box[1])).all()):
                 raise InputError(
                     "expected an initial place inside the box, got one outside or on its border; "
@@ -244,10 +241,7 @@ class ReverberationParameters(nn.Module):
 
     def coordinates(self) -> list[Coordinate]:
         """Gain [dB] and decay [s]."""
-        slopes = torch.tensor(NEPERS_PER_DB), 1 / self.log_decay.detach().exp()
-        return [
-            Coordinate("reverberation.gain", "dB", {"log_gain": slopes[0]}, 3.0),
-            Coordinate(
-                "reverberation.decay", "s", {"log_decay": slopes[1]}, 0.3 / float(slopes[1])
-            ),
-        ]
+        decay, rate = self.log_decay.detach().exp(), torch.tensor(NEPERS_PER_DB)
+        level = Coordinate("reverberation.gain", "dB", {"log_gain": rate}, 3.0)
+        late = Coordinate("reverberation.decay", "s", {"log_decay": 1 / decay}, 0.3 * float(decay))
+        return [level, late]

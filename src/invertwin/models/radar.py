@@ -23,6 +23,8 @@ from invertwin.scene.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.simulation import simulate
 
+_Reference = tuple[Scene, channel.Link, Literal["rays", "area"]]  # of `for_differences`
+
 
 @dataclass(frozen=True)
 class SurrogateMap(ForwardModel):
@@ -52,9 +54,7 @@ class SurrogateMap(ForwardModel):
     coherent: Sequence[str] = ()
     stretch: Annotated[float, Ge(1)] = 1.0
     mirrors: Sequence[str] = ()
-    _reference: tuple[Scene, Radar, Literal["rays", "area"]] | None = field(
-        default=None, repr=False
-    )
+    _reference: _Reference | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         chosen = surrogates.resolve_surrogate(self.surrogate)
@@ -83,12 +83,8 @@ class SurrogateMap(ForwardModel):
 
     def predict(self, scene: Scene, sensor: Radar, seed: int) -> Float[Tensor, "frame range u v"]:
         """Predict the expected power spectrum. See ``ForwardModel.predict``."""
-        reference = None
-        if self._reference is not None:
-            fixed, device, scheme = self._reference
-            reference = fixed, device.link(), scheme
         how: dict[str, Any] = {n: getattr(self, n) for n in ("coherent", "stretch", "mirrors")}
-        how |= {"sampling": self.sampling, "seed": seed, "reference": reference}
+        how |= {"sampling": self.sampling, "seed": seed, "reference": self._reference}
         return surrogates.surrogate_spectrum(scene, sensor, self.grid, self.kernels, **how)
 
     def predict_batch(
@@ -138,7 +134,7 @@ class SurrogateMap(ForwardModel):
     ) -> "SurrogateMap":
         """Return the model with sampling probabilities of this scene."""
         sampling = replace(self.sampling, samples=samples, boundary_samples=0)
-        return replace(self, sampling=sampling, _reference=(scene, sensor, scheme))
+        return replace(self, sampling=sampling, _reference=(scene, sensor.link(), scheme))
 
     def realisations(self, scene: Scene, sensor: Radar, seed: int) -> Realisations | None:
         """Return spectra of one scene with other speckle and other phases of coherent targets.

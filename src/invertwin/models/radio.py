@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Float64, Int64
@@ -100,7 +100,8 @@ class CoverageMap(ForwardModel):
         return replace(self, blur=fraction * self.blur, softness=soft)
 
 
-QUANTITIES = ("received_power", "path_gain", "gain", "sinr", "delay_spread")
+Quantity = Literal["received_power", "path_gain", "gain", "sinr", "delay_spread"]
+QUANTITIES: tuple[str, ...] = get_args(Quantity)
 """Quantities of a ``RadioMap``."""
 
 
@@ -131,9 +132,7 @@ class RadioMap(ForwardModel):
 
     places: ReceiverLocations
     propagation: PropagationSettings
-    quantity: Literal["received_power", "path_gain", "gain", "sinr", "delay_spread"] = (
-        "received_power"
-    )
+    quantity: Quantity = "received_power"
     floor_db: float = -200.0
     noise_dbm: float = -100.0
     scatter: NonNegative | None = None

@@ -65,10 +65,8 @@ class RadarTrajectory(nn.Module):
             )
         walk = (self.drift * free_part(self.latent, self._axes)).cumsum(0)
         knots = torch.cat([torch.zeros_like(walk[:1]), walk])
-        place = torch.linspace(0, steps, frames, dtype=torch.float64, device=walk.device)
-        before = place.floor().clamp_max(steps - 1).long()
-        share = (place - before)[:, None]
-        return (1 - share) * knots[before] + share * knots[before + 1]
+        rows = nn.functional.interpolate(knots.T[None], frames, mode="linear", align_corners=True)
+        return rows[0].T
 
     def forward(self, radar: Radar) -> Radar:
         """Return the radar on the corrected trajectory."""

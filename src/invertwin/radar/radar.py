@@ -76,10 +76,7 @@ class Radar:
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per pose"
-        positions = checks.checked_tensor(
-            self.positions, (None, 3), "radar positions", do, MAX_LENGTH
-        )
-        checks.check_some(positions, "radar pose", do)
+        positions = checks.checked_positions(self.positions, "radar positions", "radar pose", do)
         checks.set_fields(self, positions=positions)
         if self.rotations is not None:
             checks.set_fields(self, rotations=_checked_rotations(self.rotations, len(positions)))
@@ -133,10 +130,8 @@ class Radar:
     @property
     def has_range_bias(self) -> bool:
         """True if ranges have a bias, or a derivative with respect to one."""
-        bias = self.range_bias
-        if isinstance(bias, Tensor):
-            return checks.is_differentiated(bias) or bool(bias)
-        return bias != 0
+        bias = torch.as_tensor(self.range_bias)
+        return checks.is_differentiated(bias) or bool(bias)
 
     @property
     def origins(self) -> Float64[Tensor, " frame"]:
@@ -171,9 +166,7 @@ class Radar:
         Args:
             point: centre of the scene in the world [m].
         """
-        center = checks.checked_tensor(
-            point, (3,), "the centre of the scene", "give [x, y, z] in metres"
-        )
+        center = checks.checked_point(point, "the centre of the scene [m]")
         link = self.link()
         ways = (link.tx - center).norm(dim=1) + (link.rx - center).norm(dim=1)
         return replace(self, range_origin=0.5 * ways.detach())
@@ -230,12 +223,9 @@ class Radar:
         if not len(chosen):
             return replace(self, positions=self.positions[chosen])  # raises the error
         # Copy without validation, since a fit calls this in every step.
-        radar, origin = copy(self), self.range_origin
-        checks.set_fields(
-            radar, positions=self.positions[chosen], rotations=self._rotations[chosen]
-        )
-        if origin is not None:
-            checks.set_fields(radar, range_origin=origin[chosen])
+        radar, places, turns = copy(self), self.positions[chosen], self._rotations[chosen]
+        origin = None if self.range_origin is None else self.range_origin[chosen]
+        checks.set_fields(radar, positions=places, rotations=turns, range_origin=origin)
         return radar
 
     def grid(

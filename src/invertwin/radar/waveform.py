@@ -12,7 +12,7 @@ from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
 from invertwin import limits
-from invertwin.checks import check_choice, check_fields
+from invertwin.checks import CheckedFields, check_choice
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.errors import PhysicsWarning as PhysicsWarning
@@ -25,7 +25,7 @@ _Symbols = Complex[Tensor, "*#batch sample"]
 _Values = Float64[Tensor, " point"]  # one at every point
 
 
-class Waveform(ABC):
+class Waveform(CheckedFields, ABC):
     """Base class of waveforms. Waveforms are hashable, so that kernels are cached.
 
     Attributes:
@@ -37,9 +37,6 @@ class Waveform(ABC):
 
     center_frequency: float
     bandwidth: float
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def wavelength(self) -> float:

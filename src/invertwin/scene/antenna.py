@@ -17,7 +17,7 @@ from torch import Tensor
 
 from invertwin import checks
 from invertwin.errors import InputError
-from invertwin.limits import MAX_LENGTH, RADIANS, Count, NonNegative, Positive
+from invertwin.limits import RADIANS, Count, NonNegative, Positive
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene.polarisation import JonesTable, Polarisation, checked_angles
 from invertwin.scene.pose import Basis
@@ -210,12 +210,10 @@ class AntennaArray:
 
     def __post_init__(self) -> None:
         do = "give one position [x, y, z] in metres per element"
-        positions = checks.checked_tensor(
-            self.positions, (None, 3), "element positions", do, MAX_LENGTH
-        )
-        checks.check_some(positions, "antenna element", do)
+        what = "element positions"
+        positions = checks.checked_positions(self.positions, what, "antenna element", do)
         do = "spectra do not differentiate their steering: detach them"
-        checks.refuse_derivatives(positions, "element positions", do)
+        checks.refuse_derivatives(positions, what, do)
         do = "give Isotropic(), Cosine(exponent) or Table(theta, phi, gains)"
         checks.checked_type(self.pattern, Pattern, "a pattern", do)
         jones = Polarisation.from_jones(self.polarisation, self.leakage, len(positions))
@@ -272,14 +270,24 @@ def planar_array(
         InputError: no elements, or a spacing that is not positive.
     """
     require_at_most(count[0] * count[1], _MAX_ELEMENTS, "antenna elements", "lower count", "count")
-    y = _centre_positions(count[0], spacing[0], "elements along y")
-    plane = torch.cartesian_prod(y, _centre_positions(count[1], spacing[1], "elements along z"))
+    y = centre_positions(count[0], spacing[0], "elements along y")
+    plane = torch.cartesian_prod(y, centre_positions(count[1], spacing[1], "elements along z"))
     positions = torch.cat([torch.zeros_like(plane[:, :1]), plane], dim=1)
     gain = Isotropic() if pattern is None else pattern
     return AntennaArray(positions, gain, polarisation, leakage)
 
 
-def _centre_positions(count: int, spacing: float, what: str) -> Tensor:
+def centre_positions(count: int, spacing: float, what: str) -> Float64[Tensor, " element"]:
+    """Place elements along a line, centred on zero.
+
+    Args:
+        count: number of elements.
+        spacing: distance of neighbours [m].
+        what: noun for the elements, for the message.
+
+    Raises:
+        InputError: no element, or a spacing that is not positive.
+    """
     number = checks.checked_count(count, what, 1)
     distance = checks.checked_number(spacing, "element spacing [m]", 0.0, open_low=True)
     return (torch.arange(number, dtype=torch.float64) - (number - 1) / 2) * distance

@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from invertwin.checks import check_choice, checked_tensor
-from invertwin.errors import InputError, PhysicsWarning
+from invertwin.errors import InputError, PhysicsWarning, prefix_errors
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import shapes
 from invertwin.scene.material.materials import PerfectConductor, RoughConductor, RoughDielectric
@@ -124,7 +124,7 @@ def _load_with(
                 vertices = _GLTF.inverse.vectors(torch.from_numpy(vertices)).numpy()
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
-    try:
+    with prefix_errors(str(path)):
         # Check the raw file first: merging would hide its defects.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
@@ -132,8 +132,6 @@ def _load_with(
         meshes = {name: _drop_repetitions(unite_parts(mesh)) for name, mesh in merged.items()}
         if not meshes:
             raise InputError("expected triangles, got none; export the mesh again")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     for name, mesh in meshes.items():
         notes = [f"the mesh has {text}" for text in find_defects(mesh).in_words()]
         if mesh is not merged[name]:
@@ -214,10 +212,8 @@ def load_scene_xml(
     with untrusted.convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
         require_at_most(len(root), _MAX_SHAPES, "shapes", "join those of one material")
-    try:
+    with prefix_errors(str(file)):
         return _build_scene(root, file, dict(materials or {}), default)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
 
 
 def save_scene_xml(path: str | Path, scene: Scene) -> None:
@@ -254,8 +250,8 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
     with replace_file(file) as part:
         (file.parent / "meshes").mkdir(exist_ok=True)
         for number, item in enumerate(scene.objects.values()):
-            mesh = Mesh(item.vertices, item.mesh.faces)
-            save_mesh(file.parent / "meshes" / f"{number}.ply", mesh)
+            place = file.parent / "meshes" / f"{number}.ply"
+            save_mesh(place, Mesh(item.vertices, item.mesh.faces))
         part.write_bytes(ElementTree.tostring(root))
 
 
@@ -354,14 +350,13 @@ def _count_corners(kind: str) -> int:
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     used = np.unique(faces)
     # Adding zero turns −0 into 0, the same position.
-    _, first, group = np.unique(
-        vertices[used] + 0.0, axis=0, return_index=True, return_inverse=True
-    )
+    places = vertices[used]
+    _, first, group = np.unique(places + 0.0, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.argsort(order)
     renumbered = np.empty(len(vertices), dtype=np.int64)
     renumbered[used] = rank[group.ravel()]
-    return Mesh(torch.from_numpy(vertices[used][first[order]]), torch.from_numpy(renumbered[faces]))
+    return Mesh(torch.from_numpy(places[first[order]]), torch.from_numpy(renumbered[faces]))
 
 
 def _drop_repetitions(mesh: Mesh) -> Mesh:
@@ -414,10 +409,8 @@ def _build_scene(
         named = [part for part in map(element.find, ("ref", "bsdf")) if part is not None]
         material = named[0].get("id", "") if named else ""
         referred.add(material)
-        try:
+        with prefix_errors(f"shape {name!r}"):
             mesh = _shape(element, file)
-        except InputError as error:
-            raise InputError(f"shape {name!r}: {error}") from None
         objects[name] = Object(mesh, known.get(material, default))
     unused = sorted(set(materials) - referred)
     if unused:
@@ -433,10 +426,8 @@ def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
     found: dict[str, Material] = {}
     for element in root.iter("bsdf"):
         name = element.get("id", "")
-        try:
+        with prefix_errors(f"material {name!r}"):
             material = read_radio_material(element)
-        except InputError as error:
-            raise InputError(f"material {name!r}: {error}") from None
         if material is not None:
             found[name] = material
     return found
@@ -445,11 +436,10 @@ def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
 def _shape(element: ElementTree.Element, file: Path) -> Mesh:
     kind = element.get("type")
     if kind in ("obj", "ply"):
+        name = _property(element, "string", "filename", "")
         with warnings.catch_warnings():  # scene files are in metres, however large
             warnings.simplefilter("ignore", PhysicsWarning)
-            mesh = load_mesh(
-                untrusted.named_file(file, _property(element, "string", "filename", ""))
-            )
+            mesh = load_mesh(untrusted.named_file(file, name))
     elif kind == "rectangle":
         # Mitsuba's rectangle lies in the x-y plane and faces +z; ours in y-z faces −x.
         upright = shapes.plate(2.0, 2.0)

@@ -10,7 +10,7 @@ from annotated_types import MinLen
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from invertwin.checks import checked_tensor, strip_derivatives
+from invertwin.checks import checked_tensor, set_fields, strip_derivatives, to_tensor
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
 from invertwin.scene import mesh_topology
@@ -62,8 +62,7 @@ class Mesh:
     def __post_init__(self) -> None:
         do = "repair the mesh before loading it"
         vertices = checked_tensor(self.vertices, (None, 3), "mesh vertices", do, MAX_LENGTH)
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", checked_faces(self.faces, len(vertices)))
+        set_fields(self, vertices=vertices, faces=checked_faces(self.faces, len(vertices)))
 
     def summary(self) -> "MeshSummary":
         """Return its size and topology, of welded vertices and divided edges as rays meet them."""
@@ -111,13 +110,8 @@ def checked_faces(faces: object, vertex_count: int) -> Tensor:
     Raises:
         InputError: wrong type or shape, no faces, or an index out of range.
     """
-    try:
-        indices = torch.as_tensor(faces)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(
-            f"expected mesh faces as integers of shape [any, 3], got {type(faces).__name__}; "
-            "give a tensor or array of vertex indices"
-        ) from None
+    do = "give a tensor or array of vertex indices"
+    indices = to_tensor(faces, "mesh faces as integers of shape [any, 3]", do, None)
     # An empty list becomes a float tensor: report a mesh without faces.
     if indices.numel() == 0 or vertex_count == 0:
         raise InputError(

@@ -91,8 +91,7 @@ def _closed_body(
     if mesh_topology.find_inward_faces(faces, points).any():
         return None
     used, local = np.unique(faces, return_inverse=True)
-    mesh = manifold3d.Mesh64(
-        vert_properties=points[used], tri_verts=local.reshape(-1, 3).astype(np.uint64)
-    )
+    triangles = local.reshape(-1, 3).astype(np.uint64)
+    mesh = manifold3d.Mesh64(vert_properties=points[used], tri_verts=triangles)
     body = manifold3d.Manifold(mesh)
     return body if body.status() == manifold3d.Error.NoError else None

@@ -14,21 +14,14 @@ from annotated_types import Ge, MinLen
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_point, checked_tensor
 from invertwin.deprecation import rename_members
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH, Axes
 from invertwin.scene import pose
 from invertwin.scene.material.itu import Itu
 from invertwin.scene.material.materials import select_layer
-from invertwin.scene.material.values import (
-    RANGES,
-    MaterialValue,
-    Texture,
-    Value,
-    checked_value,
-    evaluate_value,
-)
+from invertwin.scene.material.values import RANGES, MaterialValue, Texture, Value, checked_value
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.scene import Object, Scene
 
@@ -343,7 +336,8 @@ class MaterialValues(nn.Module):
             if isinstance(checked, Texture):
                 self._textures[name] = checked
                 checked = checked.image
-            self.raw[name] = nn.Parameter(_to_unbounded(name, evaluate_value(checked).detach()))
+            first = torch.as_tensor(checked, dtype=torch.float64).detach()
+            self.raw[name] = nn.Parameter(_to_unbounded(name, first))
 
     @classmethod
     def from_object(
@@ -522,7 +516,7 @@ def free_part(parameter: Tensor, mask: Tensor) -> Tensor:
 
 def _vector(value: ArrayLike, what: str) -> Tensor:
     # A copy, since the optimiser changes the parameter in place.
-    return checked_tensor(value, (3,), what, "give x, y, z", MAX_LENGTH).detach().clone()
+    return checked_point(value, what, most=MAX_LENGTH).detach().clone()
 
 
 def _rotation_numbers(value: ArrayLike) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from invertwin.checks import ArrayLike, check_choice, checked_tensor
+from invertwin.checks import ArrayLike, check_choice, checked_point, checked_tensor, to_tensor
 from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
@@ -98,7 +98,7 @@ def rigid(
     Raises:
         InputError: wrong shapes, or NaN.
     """
-    moved = checked_tensor(translation, (3,), "translation [m]", "give x, y, z", MAX_LENGTH)
+    moved = checked_point(translation, "translation [m]", most=MAX_LENGTH)
     turned = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
     turned = checked_tensor(turned, (3, 3), "rotation", "give a 3 × 3 matrix")
     top = torch.cat([turned, moved[:, None]], dim=1)
@@ -118,7 +118,7 @@ def look_at(
         InputError: wrong shapes, NaN, or a target straight above or below a position.
     """
     places = checked_tensor(positions, (None, 3), "positions [m]", "give x, y, z of each")
-    aim = checked_tensor(target, (3,), "target [m]", "give x, y, z")
+    aim = checked_point(target, "target [m]")
     boresight = aim - places
     left = torch.linalg.cross(boresight.new_tensor([[0.0, 0.0, 1.0]]), boresight)
     if bool((left.norm(dim=1) < 1e-6 * (1 + boresight.norm(dim=1))).any()):
@@ -236,10 +236,7 @@ def _convert(value: Convertible | ArrayLike, basis: Basis) -> Convertible | Tens
         return value.change_basis(basis)
     do = "give points [*, 3], poses [*, 4, 4], a mesh, an object, a scene or an antenna array"
     known = isinstance(value, Tensor) and value.is_floating_point()
-    try:
-        tensor = torch.as_tensor(value, dtype=None if known else torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"expected coordinates, got {type(value).__name__}; {do}") from None
+    tensor = to_tensor(value, "coordinates", do, None if known else torch.float64)
     if tensor.shape[-2:] == (4, 4):
         return basis.poses(tensor)
     if tensor.shape[-1:] != (3,):

@@ -214,9 +214,8 @@ class _EditableMesh:
         rows = np.nonzero(is_selected(length))[0]
         for row in rows[np.argsort(order * length[rows], kind="stable")]:
             a, b = edges[row].tolist()
-            if self.around[a] & self.around[b] and is_selected(
-                np.linalg.norm(self.positions[a] - self.positions[b])
-            ):
+            apart = np.linalg.norm(self.positions[a] - self.positions[b])
+            if self.around[a] & self.around[b] and is_selected(apart):
                 yield a, b
 
     def _neighbours(self, vertex: int) -> set[int]:

@@ -16,6 +16,7 @@ from invertwin.scene.shapes import box
 _TOP = 0.03  # thickness of boards [m]
 _LEG = 0.05  # width of legs [m]
 _SHELF_BOARDS = 5
+_Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # sides and middle [m]
 _FURNITURE = ("table", "chair_1", "chair_2", "shelf", "sofa")
 
 _ITU = read_table("invertwin.scene", "rooms.toml")["itu"]
@@ -85,15 +86,13 @@ def _panel(middle: Sequence[float], first: Sequence[float], second: Sequence[flo
     return Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
-def _boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
+def _boxes(*parts: _Box) -> Mesh:
     """Return boxes by size and centre."""
     meshes = [(box(size), torch.tensor(middle, dtype=torch.float64)) for size, middle in parts]
     return concatenate_meshes([Mesh(mesh.vertices + middle, mesh.faces) for mesh, middle in meshes])
 
 
-def _legs(
-    x: float, y: float, top: float
-) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
+def _legs(x: float, y: float, top: float) -> list[_Box]:
     """Return four legs that end just below the top."""
     high = top - 1e-3
     places = [(sx * x, sy * y) for sy in (-1, 1) for sx in (-1, 1)]

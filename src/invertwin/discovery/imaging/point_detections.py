@@ -60,7 +60,8 @@ def detect_moving_targets(
     rows = moves.nonzero()[:, 0]
     if not len(rows):
         return []
-    labels = label_groups(torch.stack([points.range, rates], dim=1)[rows] / scales, 1.0)
+    places = torch.stack([points.range, rates], dim=1)
+    labels = label_groups(places[rows] / scales, 1.0)
     flat = doppler.range_doppler(beat[frame : frame + 1], radar.frames([frame]), grid, chirps)
     # With the mean, the noise of range rates near 0 is removed too.
     noisy = flat[:, doppler.velocity_axis(radar, chirps).abs() > 0.75 * cell]
@@ -75,10 +76,7 @@ def detect_moving_targets(
         power = float(points.power[best])
         # The extent of a group bounds the accuracy of its position.
         weight = points.power[own] / points.power[own].sum()
-        spread = [
-            float((weight * (values[own] - values[best]).square()).sum().sqrt())
-            for values in (points.range, rates)
-        ]
+        spread = (weight @ (places[own] - places[best]).square()).sqrt().tolist()
         position = points.position[best].detach().double()
         across = beam * float((position - origin).norm())
         deviations = {

@@ -145,9 +145,7 @@ def compute_response(
 
 
 def reconstruct_reflectivity(
-    response: ImageResponse,
-    power: _Maps,
-    known_power: _Maps,
+    response: ImageResponse, power: _Maps, known_power: _Maps
 ) -> Float64[Tensor, " point"]:
     """Compute the maximum-likelihood reflectivity by multiplicative updates.
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from invertwin import scene as scenes
-from invertwin.checks import check_fields
+from invertwin.checks import CheckedFields
 from invertwin.constants import read_table
 from invertwin.limits import Positive
 from invertwin.scene.parameters import Coordinate, position_coordinates
@@ -61,7 +61,7 @@ class Matte(scenes.Material):
 
 
 @dataclass(frozen=True)
-class ShapeParameters:
+class ShapeParameters(CheckedFields):
     """Parameters of a shape on the ground.
 
     Attributes:
@@ -86,9 +86,6 @@ class ShapeParameters:
     width: Positive = 0.3
     height: float = 0.8
     brightness: Positive = 0.1
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def is_rectangular(self) -> bool:
@@ -202,12 +199,10 @@ class PrimitiveModel(UnknownShape):
         super().__init__(name, level, start.position, start.brightness)
         self.kind: ShapeKind = start.kind
         self.round = start.has_free_height
-        self.low, self.high = SIZE_LIMITS.get(start.kind, (_MIN_SIZES, _MAX_SIZES))
-        given = (start.length, start.width, start.height)
-        sizes = [
-            min(max(v, low), high) for v, low, high in zip(given, self.low, self.high, strict=True)
-        ]
-        logs = torch.tensor(sizes, dtype=torch.float64).log() / self.SIZE_SCALE
+        limits = SIZE_LIMITS.get(start.kind, (_MIN_SIZES, _MAX_SIZES))
+        self.low, self.high = (torch.tensor(sizes, dtype=torch.float64) for sizes in limits)
+        given = torch.tensor([start.length, start.width, start.height], dtype=torch.float64)
+        logs = given.clamp(self.low, self.high).log() / self.SIZE_SCALE
         if self.round:
             logs[2] = start.height
         self.turn = nn.Parameter(torch.tensor(start.yaw / self.TURN_SCALE, dtype=torch.float64))
@@ -216,8 +211,7 @@ class PrimitiveModel(UnknownShape):
     @property
     def sides(self) -> Float64[Tensor, "3"]:
         """Return length, width and height within bounds [m]; the last is unused for a sphere."""
-        low, high = (torch.tensor(v, dtype=torch.float64).log() for v in (self.low, self.high))
-        return (self.SIZE_SCALE * self.size).clamp(low, high).exp()
+        return (self.SIZE_SCALE * self.size).clamp(self.low.log(), self.high.log()).exp()
 
     @property
     def shape(self) -> ShapeParameters:

@@ -94,12 +94,8 @@ def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tens
     for axis, name in zip(own[[1, 2, 0]], ("pitch", "yaw", "roll"), strict=True):
         if name not in free:
             continue
-        alike = (
-            order
-            for order in _SYMMETRY_ORDERS
-            if _surface_distance(rotate_object(2 * math.pi / order * axis), kept[0])
-            < _SIMILAR_DISTANCE
-        )
+        meshes = ((order, rotate_object(2 * math.pi / order * axis)) for order in _SYMMETRY_ORDERS)
+        alike = (k for k, mesh in meshes if _surface_distance(mesh, kept[0]) < _SIMILAR_DISTANCE)
         parts = next(alike, 1)
         for share in (0.5, *(k / parts for k in range(1, parts))):
             vector = 2 * math.pi * (share - (share > 0.5)) * axis

@@ -239,10 +239,8 @@ class CovarianceEstimator:
             vector = torch.zeros(len(spans), dtype=torch.float64)
             vector[known] = axis
             predicted = 0.5 * _PROFILE_DISTANCE**2 / float(vector @ inverse @ vector)
-            rise = min(
-                self._profile_loss(far * vector, spans, target)
-                for far in (_PROFILE_DISTANCE, -_PROFILE_DISTANCE)
-            )
+            ends = (_PROFILE_DISTANCE, -_PROFILE_DISTANCE)
+            rise = min(self._profile_loss(far * vector, spans, target) for far in ends)
             more = error * (predicted / max(rise, _MIN_LOSS_RISE * predicted) - 1)
             covariance = covariance + max(more, 0.0) * vector * vector[:, None]
         return covariance

@@ -375,9 +375,8 @@ def _incoherent_power(maps: Tensor, radar: Radar, grid: Grid, points: Tensor) ->
             (seen[:, 2] - grid.v_start) / grid.v_step * (grid.v_count > 1),
         )
         # Beyond the outer bins the map falls to zero within one bin.
-        sampled = map_coordinates(
-            maps[frame].numpy(), torch.stack(places).numpy(), order=1, mode="grid-constant"
-        )
+        table, nodes = maps[frame].numpy(), torch.stack(places).numpy()
+        sampled = map_coordinates(table, nodes, order=1, mode="grid-constant")
         total += torch.from_numpy(sampled) * ranges**4 * (seen[:, 0] > 0)
     return total / radar.frame_count
 

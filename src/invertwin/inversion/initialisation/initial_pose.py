@@ -114,9 +114,8 @@ class InitialPoseEstimator:
         if self.pose == "axes":
             rectangle = detections.principal_rectangle(points)
         else:
-            rectangle = detections.fit_rectangle(
-                points, radar, resolution=radar.waveform.range_resolution
-            )
+            cell = radar.waveform.range_resolution
+            rectangle = detections.fit_rectangle(points, radar, resolution=cell)
         if self.scale:
             scale = Scale(name, detections.estimate_scale(item, rectangle))
             scene = scale.requires_grad_(False)(scene)

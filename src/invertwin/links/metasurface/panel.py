@@ -23,6 +23,7 @@ from invertwin.errors import InputError
 from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import Scene
+from invertwin.scene.antenna import centre_positions
 
 _VALUES_PER_CHUNK = 1 << 22  # of antennas and elements
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
@@ -63,9 +64,7 @@ class Metasurface:
 
     def __post_init__(self) -> None:
         what = "of a metasurface"
-        place = checks.checked_tensor(
-            self.position, (3,), f"position {what}", "give x, y, z", MAX_LENGTH
-        )
+        place = checks.checked_point(self.position, f"position {what}", most=MAX_LENGTH)
         axes = checks.checked_tensor(self.axes, (3, 3), f"axes {what}", "give them as columns")
         checks.check_orthonormal(axes, f"axes {what}", "give the normal, y and z")
         do = "give one for each element, along y and z"
@@ -86,10 +85,7 @@ class Metasurface:
     @property
     def cells(self) -> channel.PanelCells:
         """Cells of the elements, in row-major order of (y, z)."""
-        offsets = [
-            (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * self.spacing
-            for count in self.phase.shape
-        ]
+        offsets = [centre_positions(n, self.spacing, "elements") for n in self.phase.shape]
         grid = torch.stack(torch.meshgrid(*offsets, indexing="ij"), -1).reshape(-1, 2)
         return channel.PanelCells(self.position, self.axes, grid, (self.spacing, self.spacing))
 
@@ -113,8 +109,7 @@ class Metasurface:
             target: Focal point [3] [m].
             frequency: [Hz].
         """
-        do = "give x, y, z"
-        ends = [checks.checked_tensor(p, (3,), "ends of a focus [m]", do) for p in (tx, target)]
+        ends = [checks.checked_point(p, "ends of a focus [m]") for p in (tx, target)]
         length = (self.cells.centers[:, None] - torch.stack(ends)).norm(dim=2).sum(1)
         turn = 2 * math.pi * frequency / SPEED_OF_LIGHT * length
         return replace(self, phase=self.phase + turn.view(self.phase.shape))
@@ -262,9 +257,8 @@ def _paths_over_panel(
     source, target = link // hearers, link % hearers
     ways = [panel.position - ends[0][source], panel.position - ends[1][target]]
     units = [normalize(way, dim=1) for way in ways]
-    sent, received = (
-        channel.polarisations(unit, torch.tensor(_UP, dtype=torch.float64)) for unit in units
-    )
+    up = torch.tensor(_UP, dtype=torch.float64)
+    sent, received = (channel.polarisations(unit, up) for unit in units)
     normal = panel.axes[:, 0]
     turned = sent - 2 * (sent @ normal)[..., None] * normal
     delay = (ways[0].norm(dim=1) + ways[1].norm(dim=1)) / SPEED_OF_LIGHT

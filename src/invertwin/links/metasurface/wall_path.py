@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
 
-from invertwin.checks import ArrayLike, checked_count, checked_number, checked_tensor
+from invertwin.checks import ArrayLike, checked_count, checked_number, checked_point, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.links.metasurface.panel import Metasurface
@@ -171,9 +171,8 @@ class PanelPlacement(nn.Module):
         super().__init__()
         self.path = path
         self._limits = {"yaw": yaw_limit, "spread": spread_limit}
-        do = "give x, y, z"
-        self._tx = checked_tensor(tx, (3,), "place of a transmitter [m]", do)
-        self._target = checked_tensor(target, (3,), "target of a focus [m]", do)
+        self._tx = checked_point(tx, "place of a transmitter [m]")
+        self._target = checked_point(target, "target of a focus [m]")
         self._frequency = checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         place = checked_number(along, "place of a panel [m]", -math.inf)
         turn = checked_number(yaw, "yaw of a panel [rad]", -math.inf)

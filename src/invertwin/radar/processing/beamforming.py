@@ -70,8 +70,5 @@ def _separable_power(channels: Tensor, array: Aperture, grid: Grid) -> Tensor:
         u = steer(grid.u, array.y, array.y_taper * array.counts.sum(1))
         plane = torch.einsum("uy,fryv->fruv", u, plane)
     power = plane.abs().square()
-    if grid.u_count == 1:
-        power = power.mean(2, keepdim=True)
-    if grid.v_count == 1:
-        power = power.mean(3, keepdim=True)
-    return power
+    single = [dim for dim, count in ((2, grid.u_count), (3, grid.v_count)) if count == 1]
+    return power.mean(single, keepdim=True) if single else power

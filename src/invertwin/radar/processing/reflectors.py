@@ -67,19 +67,16 @@ def detect_points(
     if chirps is not None:
         offsets = doppler.interpolate_rates(flat)
         cube = doppler.compensate_tdm(cube, radar, chirps, offsets)
-        rates = doppler.velocity_axis(radar, chirps)[:, None] + offsets * doppler.velocity_span(
-            radar, chirps
-        )
+        span = doppler.velocity_span(radar, chirps)
+        rates = doppler.velocity_axis(radar, chirps)[:, None] + offsets * span
     cube = cube[0].to(torch.complex128)
     looks = len(radar.virtual_positions)
     noise = noise_power(flat, looks)
     rows: list[list[float]] = []
     for v, r in track(_find_cells(everywhere, radar, grid, looks), "points"):
         near = [max(r - 1, 0), r, min(r + 1, grid.range_count - 1)]
-        place = (
-            float(grid.ranges[r])
-            + float(doppler.interpolate_peak(*flat[v, near])) * grid.range_step
-        )
+        offset = float(doppler.interpolate_peak(*flat[v, near]))
+        place = float(grid.ranges[r]) + offset * grid.range_step
         directions = _resolve_directions(cube[v, :, :, r], radar, grid, noise)
         rows += [[place, float(rates[v, r]), *direction] for direction in directions]
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
@@ -175,7 +172,7 @@ def _resolve_directions(cell: Tensor, radar: Radar, grid: Grid, noise: float) ->
     channels, left = cell.flatten(), cell
     one = replace(grid, range_start=0.0, range_count=1)
     seen = grid.u[:, None].square() + grid.v.square() <= 1
-    false = -math.log(_FALSE_DIRECTION_RATE / float(seen.sum()))
+    least = -math.log(_FALSE_DIRECTION_RATE / float(seen.sum())) * noise / len(channels)
     places: list[tuple[float, float]] = []
     powers: list[float] = []
     for _ in range(max(1, len(channels) // 2)):
@@ -186,9 +183,7 @@ def _resolve_directions(cell: Tensor, radar: Radar, grid: Grid, noise: float) ->
         models = torch.stack([_plane_wave(radar, grid, *place) for place in [*places, (u, v)]], 1)
         amplitudes = torch.linalg.lstsq(models, channels[:, None]).solution
         found = amplitudes.abs().square()[:, 0].tolist()
-        if powers and found[-1] < max(
-            _MIN_RELATIVE_POWER * powers[0], false * noise / len(channels)
-        ):
+        if powers and found[-1] < max(_MIN_RELATIVE_POWER * powers[0], least):
             break
         if any(_share_beam(radar, (u, v), place) for place in places):
             break

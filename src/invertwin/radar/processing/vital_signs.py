@@ -25,9 +25,8 @@ from invertwin.radar.radar import Radar
 _BREATHING_BAND = 0.1, 0.7  # Hz
 _HEART_BAND = 0.8, 3.0  # Hz
 _FALSE_ALARM = 0.01  # probability that noise counts as an oscillation
-_LEAST_ROUNDNESS = (
-    8.0  # of the samples about their circle, see estimate_displacement; noise has 4.7
-)
+# Of the samples about their circle, see estimate_displacement; noise has 4.7.
+_LEAST_ROUNDNESS = 8.0
 _TINY = 1e-300  # for bins without echoes
 _PADDING = 64  # frequencies for each that the duration resolves
 

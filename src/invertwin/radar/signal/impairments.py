@@ -20,7 +20,7 @@ from jaxtyping import Complex, Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel import Paths
-from invertwin.checks import check_fields, checked_number, refuse_derivatives
+from invertwin.checks import CheckedFields, check_fields, checked_number, refuse_derivatives
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS, Decibels, NonNegative, Positive, UsualValue
 from invertwin.radar.radar import Radar, require_sampled_waveform
@@ -83,7 +83,7 @@ class PhaseNoise:
 
 
 @dataclass(frozen=True)
-class Leakage:
+class Leakage(CheckedFields):
     """Direct path from transmitters to receivers, equal in every channel.
 
     Attributes:
@@ -97,12 +97,9 @@ class Leakage:
     delay: Annotated[NonNegative, UsualValue("seconds", 1e-9, high=1e-6)]
     level_db: Level
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-
 
 @dataclass(frozen=True)
-class ADC:
+class ADC(CheckedFields):
     """Converter of I and Q: uniform steps, two's complement codes, clipping.
 
     Attributes:
@@ -116,9 +113,6 @@ class ADC:
 
     bits: Annotated[int, Ge(2), Le(32)]
     full_scale: Positive
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def step(self) -> float:
@@ -313,27 +307,23 @@ def residual_phase(
         InputError: A waveform whose samples are not taken in time.
     """
     waveform = _require_time_samples(radar)
+    interval = float(waveform.sample_times[1])
     transmitters, samples = radar.shape[1], waveform.samples
     if chirps is None:
         runs = (radar.frame_count, transmitters)
-        return _oscillator(noise, waveform, delay, seed, runs, samples)[..., :samples]
-    starts = (chirps.times(transmitters) / float(waveform.sample_times[1])).round().long()
+        return _oscillator(noise, interval, delay, seed, runs, samples)[..., :samples]
+    starts = (chirps.times(transmitters) / interval).round().long()
     length = int(starts.max()) + samples
-    phase = _oscillator(noise, waveform, delay, seed, (radar.frame_count,), length)
+    phase = _oscillator(noise, interval, delay, seed, (radar.frame_count,), length)
     return phase[:, starts[..., None] + torch.arange(samples)]
 
 
 def _oscillator(
-    noise: PhaseNoise,
-    waveform: FMCW | SteppedFrequency,
-    delay: float,
-    seed: int,
-    runs: tuple[int, ...],
-    samples: int,
+    noise: PhaseNoise, interval: float, delay: float, seed: int, runs: tuple[int, ...], samples: int
 ) -> Float64[Tensor, "*run sample"]:
     """Return φ(t) − φ(t − τ) at the sampling rate, for independent runs of a minimum length."""
     length = _OSCILLATOR_OVERSAMPLING * samples
-    spacing = 1 / (length * float(waveform.sample_times[1]))
+    spacing = 1 / (length * interval)
     offsets = spacing * torch.arange(1, length // 2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(seed)
     lines = torch.randn((*runs, len(offsets)), dtype=torch.complex128, generator=generator)

@@ -6,7 +6,6 @@ more than a ramp of the moving paths: with one for 64 loops, a frame of a walkin
 takes about a fortieth of the time.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,6 +16,7 @@ from torch import Tensor
 from invertwin.channel import Paths
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar, require_sampled_waveform
+from invertwin.radar.signal import nufft
 from invertwin.radar.signal.chirps import Chirps, ChirpTrain, sample_interval
 from invertwin.radar.signal.range_profile import beat_signal, check_paths
 from invertwin.scene.mesh import concatenate_meshes
@@ -115,8 +115,8 @@ class _VertexTrajectories:
         tried = [begin + share * (end - begin) for share in _CHECK_SHARES]
         known = [(time, vertices(time)) for time in tried]
         for degree in _DEGREES:
-            angles = torch.arange(degree + 1, dtype=torch.float64) * math.pi / degree
-            self.places = begin + 0.5 * (1 - angles.cos()) * (end - begin)
+            # Chebyshev's nodes, as those of a ramp from 0 to 1.
+            self.places = begin + nufft.ramp_instants(2, degree + 1) * (end - begin)
             self.nodes = torch.stack([vertices(time) for time in self.places.tolist()])
             off = (float((self.interpolate(self.nodes, t) - v).abs().max()) for t, v in known)
             if all(error < _TRAJECTORY_TOLERANCE for error in off):
@@ -140,9 +140,7 @@ class _VertexTrajectories:
         if len(exact):
             return nodes[int(exact[0, 0])]
         # Barycentric weights of these nodes are ±1, ±½ at the ends.
-        weights = (-1.0) ** torch.arange(len(apart), dtype=torch.float64)
-        weights[0], weights[-1] = 0.5 * weights[0], 0.5 * weights[-1]
-        weights = weights / apart
+        weights = nufft.barycentric_weights(len(apart)) / apart
         return torch.tensordot(weights / weights.sum(), nodes, dims=1)
 
 

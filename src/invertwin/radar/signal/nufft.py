@@ -44,7 +44,7 @@ def _interpolation(samples: int, count: int) -> Float64[Tensor, "instant sample"
     """Return Lagrange polynomials through the instants, at the samples (barycentric form)."""
     apart = torch.arange(samples, dtype=torch.float64) - ramp_instants(samples, count)[:, None]
     there = apart.abs() < 1e-9
-    terms = _weights(count)[:, None] / torch.where(there, 1.0, apart)
+    terms = barycentric_weights(count)[:, None] / torch.where(there, 1.0, apart)
     return torch.where(there.any(0), there.to(apart), terms / terms.sum(0))
 
 
@@ -55,14 +55,15 @@ def instants_derivative(samples: int, count: int) -> Float64[Tensor, "instant in
         samples: number of samples in a ramp.
         count: number of instants, as in ``ramp_instants``.
     """
-    places, weight = ramp_instants(samples, count), _weights(count)
+    places, weight = ramp_instants(samples, count), barycentric_weights(count)
     apart = places[:, None] - places
     matrix = (weight / weight[:, None]) / (apart + torch.eye(count, dtype=torch.float64))
     matrix.fill_diagonal_(0.0)
     return matrix - torch.diag(matrix.sum(1))
 
 
-def _weights(count: int) -> Float64[Tensor, " instant"]:
+def barycentric_weights(count: int) -> Float64[Tensor, " instant"]:
+    """Return the weights of barycentric interpolation between instants of ``ramp_instants``."""
     weight = 1.0 - 2.0 * (torch.arange(count, dtype=torch.float64) % 2)
     weight[[0, -1]] *= 0.5
     return weight

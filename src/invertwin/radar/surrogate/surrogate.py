@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from invertwin import channel
-from invertwin.checks import check_choice, check_fields, check_shape, checked_number
+from invertwin.checks import CheckedFields, check_choice, check_shape, checked_number
 from invertwin.errors import InputError
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.aperture import Aperture, aperture
@@ -21,6 +21,7 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.surrogate import point_spread
 from invertwin.radar.waveform import PhysicsWarning, Waveform
 from invertwin.runtime.memory import require_memory
+from invertwin.scene.material.fresnel import safe_root
 from invertwin.scene.scene import Scene
 
 # Minimum extent of tabulated kernels, so that short grids do not truncate them.
@@ -31,7 +32,7 @@ _Maps = Float[Tensor, "frame range u v"]  # power of every frame
 
 
 @dataclass(frozen=True)
-class Surrogate:
+class Surrogate(CheckedFields):
     """Power point spread of one path over the bins of a spectrum.
 
     "response" kernels are those of exact signals: the power response of the sample window in range,
@@ -64,9 +65,6 @@ class Surrogate:
     range_width: NonNegative = 0.0
     angle_width: NonNegative = 0.0
     aperture_radius: Positive | None = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @classmethod
     def for_start_error(
@@ -183,23 +181,19 @@ class Surrogate:
             u, v: offsets in direction.
         """
 
-        def range_spread(places: Tensor) -> Tensor:
-            return point_spread.range_point_spread(
-                radar.waveform, places, radar.window, self.range_kernel
-            )
+        waveform, kernel = radar.waveform, self.range_kernel
 
-        power = point_spread.interpolate_response(
-            ranges, radar.waveform.range_resolution, range_spread
-        )
+        def range_spread(places: Tensor) -> Tensor:
+            return point_spread.range_point_spread(waveform, places, radar.window, kernel)
+
+        power = point_spread.interpolate_response(ranges, waveform.range_resolution, range_spread)
         u, v = u * (grid.u_count > 1), v * (grid.v_count > 1)
         if grid.u_count == grid.v_count == 1:
             return power
         array = aperture(radar)
         if self.angle_kernel == "airy":
             across, up = point_spread.airy_radii(radar, self.aperture_radius)
-            away = (across * u).square() + (up * v).square()
-            near = away == 0  # a root of zero has no derivative
-            away = torch.where(near, 0.0, torch.where(near, 1.0, away).sqrt())
+            away = safe_root((across * u).square() + (up * v).square(), 0.0)
             return power * point_spread.airy(2 * math.pi / array.wavelength * away)
         return power * point_spread.paired_array_spread(array, u, v)
 
@@ -397,12 +391,10 @@ def _kernels(
     if grid.u_count > 1 and grid.v_count > 1 and (angle_kernel == "airy" or not array.is_separable):
         spread = _angle_spread(angle_kernel, radii, array, du, dv)
         return (*kernels, _compensate_spline((2, 3), counts, spread))
-    if grid.u_count > 1:
-        spread = _angle_spread(angle_kernel, radii, array, du, zero)[:, 0]
-        kernels.append(_compensate_spline((2,), counts[:1], spread))
-    if grid.v_count > 1:
-        spread = _angle_spread(angle_kernel, radii, array, zero, dv)[0]
-        kernels.append(_compensate_spline((3,), counts[1:], spread))
+    for dim, count, lags in ((2, grid.u_count, (du, zero)), (3, grid.v_count, (zero, dv))):
+        if count > 1:
+            spread = _angle_spread(angle_kernel, radii, array, *lags).flatten()
+            kernels.append(_compensate_spline((dim,), (count,), spread))
     return tuple(kernels)
 
 

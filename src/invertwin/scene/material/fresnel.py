@@ -32,9 +32,8 @@ class FieldCoefficients(NamedTuple):
 
     def scale_reflection(self, share: Float64[Tensor, "*#angle"]) -> "FieldCoefficients":
         """Return the coefficients with the reflected field scaled."""
-        return self._replace(
-            reflection_s=share * self.reflection_s, reflection_p=share * self.reflection_p
-        )
+        s, p = share * self.reflection_s, share * self.reflection_p
+        return self._replace(reflection_s=s, reflection_p=p)
 
 
 def complex_permittivity(
@@ -115,9 +114,14 @@ def fresnel_amplitude(
     return (permittivity - 1).abs() * torch.sqrt(mean)
 
 
-def safe_root(power: Float[Tensor, "*row"]) -> Float[Tensor, "*row"]:
-    """Compute √x, with a derivative of zero where x is, which is infinite by itself."""
-    seen = power > _SAFE_POWER
+def safe_root(power: Float[Tensor, "*row"], least: float = _SAFE_POWER) -> Float[Tensor, "*row"]:
+    """Compute √x, with a derivative of zero where x is, which is infinite by itself.
+
+    Args:
+        power: values x; negative ones are treated as zero.
+        least: smaller values are treated as zero.
+    """
+    seen = power > least
     return torch.where(seen, torch.where(seen, power, 1.0).sqrt(), 0.0)
 
 

@@ -17,16 +17,8 @@ from torch import Tensor
 from invertwin.checks import checked_number
 from invertwin.errors import InputError
 from invertwin.limits import RADIANS
-from invertwin.scene.material import fresnel
+from invertwin.scene.material import fresnel, roughness
 from invertwin.scene.material.itu import Itu
-from invertwin.scene.material.roughness import (
-    ROUGH_LOBE_WIDTH,
-    ROUGH_SCATTERING,
-    SPECULAR_LOBE_WIDTH,
-    EffectiveRoughness,
-    lobe_exponent,
-    specular_weights,
-)
 from invertwin.scene.material.slab import SlabLayer, sheet_coefficients, slab_tables
 from invertwin.scene.material.surface import ANGLE_COUNT, Material, ScatteringLaw, SmoothInterface
 from invertwin.scene.material.values import RANGES, Value, checked_value, evaluate_value, row_count
@@ -171,25 +163,25 @@ class PerfectConductor(_MaterialRecord, Material):
         InputError: a width outside its range.
     """
 
-    lobe_width: Annotated[Value, RADIANS] = SPECULAR_LOBE_WIDTH
+    lobe_width: Annotated[Value, RADIANS] = roughness.SPECULAR_LOBE_WIDTH
     coherent: ClassVar[bool] = True
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law, equal at every `frequency` [Hz]."""
         checked_number(frequency, "frequency [Hz]", 0.0, open_low=True)
         nothing = torch.zeros((), dtype=torch.float64)
-        weights = specular_weights(nothing, lobe_exponent(self.lobe_width))
+        weights = roughness.specular_weights(nothing, roughness.lobe_exponent(self.lobe_width))
         return ScatteringLaw(_FULL_REFLECTANCE, *weights)
 
 
 @dataclass(frozen=True)
-class RoughConductor(_MaterialRecord, EffectiveRoughness, Material):
+class RoughConductor(_MaterialRecord, roughness.EffectiveRoughness, Material):
     """Perfect conductor with a rough surface, which scatters all power.
 
     Its fields are those of `EffectiveRoughness`; a rough surface scatters by default.
     """
 
-    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
+    scattering: Value = field(default=roughness.ROUGH_SCATTERING, kw_only=True)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law, equal at every `frequency` [Hz]."""
@@ -218,17 +210,18 @@ class RoughDielectric(Medium, Material):
     """
 
     diffuse: Value = 1.0
-    lobe_width: Annotated[Value, RADIANS] = ROUGH_LOBE_WIDTH
+    lobe_width: Annotated[Value, RADIANS] = roughness.ROUGH_LOBE_WIDTH
     depolarisation: Value = 0.0
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
-        weights = specular_weights(evaluate_value(self.diffuse), lobe_exponent(self.lobe_width))
+        diffuse, exponent = evaluate_value(self.diffuse), roughness.lobe_exponent(self.lobe_width)
+        weights = roughness.specular_weights(diffuse, exponent)
         depolarisation = evaluate_value(self.depolarisation)
         return ScatteringLaw(self._amplitude(frequency), *weights, depolarisation=depolarisation)
 
 
-class _RoughMedium(Medium, EffectiveRoughness, Material):
+class _RoughMedium(Medium, roughness.EffectiveRoughness, Material):
     """Medium with a rough surface."""
 
     def smooth_interface(self, frequency: float) -> SmoothInterface | None:
@@ -248,7 +241,7 @@ class Dielectric(_RoughMedium):
             the other fields are those of `EffectiveRoughness`; it scatters by default.
     """
 
-    scattering: Value = field(default=ROUGH_SCATTERING, kw_only=True)
+    scattering: Value = field(default=roughness.ROUGH_SCATTERING, kw_only=True)
 
     def scattering_law(self, frequency: float) -> ScatteringLaw:
         """Return the scattering law at `frequency` [Hz], differentiable w.r.t. all values."""
@@ -298,7 +291,7 @@ class Layer(Medium):
 
 
 @dataclass(frozen=True)
-class Slab(Layer, EffectiveRoughness, Material):
+class Slab(Layer, roughness.EffectiveRoughness, Material):
     """Thin sheet of one layer in air, meshed as an open surface, which reflects and transmits.
 
     Multiple reflections in the sheet are part of its coefficients, at the radar's centre frequency.
@@ -322,7 +315,7 @@ class Slab(Layer, EffectiveRoughness, Material):
 
 
 @dataclass(frozen=True)
-class Multilayer(_MaterialRecord, EffectiveRoughness, Material):
+class Multilayer(_MaterialRecord, roughness.EffectiveRoughness, Material):
     """Thin sheet of several layers in air, meshed as an open surface.
 
     Attributes:
@@ -384,9 +377,9 @@ def _select_triangles(sheet: SlabLayer, triangle: Tensor) -> SlabLayer:
 
 
 def _slab_scattering_law(
-    layers: Sequence[Layer], roughness: EffectiveRoughness, frequency: float
+    layers: Sequence[Layer], skin: roughness.EffectiveRoughness, frequency: float
 ) -> ScatteringLaw:
     tables = slab_tables([layer.sheet(frequency) for layer in layers], _COSINES, frequency)
     through = {"transmittance": tables.transmittance, "extra_length": tables.extra_length}
-    through |= roughness.depolarisation_terms
-    return ScatteringLaw(fresnel.safe_root(tables.reflectance), *roughness.weights(), **through)
+    through |= skin.depolarisation_terms
+    return ScatteringLaw(fresnel.safe_root(tables.reflectance), *skin.weights(), **through)

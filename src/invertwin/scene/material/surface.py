@@ -32,7 +32,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from invertwin.constants import SPEED_OF_LIGHT
-from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients
+from invertwin.scene.material.fresnel import FieldCoefficients, fresnel_coefficients, safe_root
 from invertwin.scene.material.slab import SlabLayer, sheet_coefficients
 
 _Values: TypeAlias = Float64[Tensor, " n"]
@@ -126,9 +126,7 @@ class ScatteringLaw:
         at = _COSINES / (2 / self.exponents[..., :1]).sqrt()
         above = at * torch.special.ndtr(at) + torch.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
         share = share * above[..., -1:] / above
-        positive = share > 0  # a root of zero has no derivative
-        spread = torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
-        return replace(self, spread=spread)
+        return replace(self, spread=safe_root(share, 0.0))
 
 
 class SmoothInterface(NamedTuple):

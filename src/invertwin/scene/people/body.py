@@ -318,10 +318,8 @@ class SkinnedBody(ObjectModule):
         Args:
             estimate, truth: estimated and true mesh.
         """
-        a, b = (
-            rotation_from_vector(self.template.estimate_rotations(mesh.vertices.detach()))
-            for mesh in (estimate, truth)
-        )
+        turns = [self.template.estimate_rotations(mesh.vertices) for mesh in (estimate, truth)]
+        a, b = map(rotation_from_vector, turns)
         angles = rotation_angle(a.mT @ b).tolist()
         return {name: angles[joint] for name, joint in self._joints.items()}
 
@@ -411,9 +409,8 @@ def load_smpl(file: str | Path, shapes: int = 10) -> BodyTemplate:
     if "posedirs" in arrays:
         poses = checked_tensor(arrays["posedirs"], (len(rest), 3, 9 * (count - 1)), "posedirs", _DO)
         # The correctives and the rotation matrices that they belong to turn alike.
-        poses = torch.einsum(
-            "ab,cd,ef,vbjdf->vajce", turn, turn, turn, poses.unflatten(2, (-1, 3, 3))
-        ).flatten(2)
+        poses = poses.unflatten(2, (-1, 3, 3))
+        poses = torch.einsum("ab,cd,ef,vbjdf->vajce", turn, turn, turn, poses).flatten(2)
     faces = torch.from_numpy(arrays["f"].astype(np.int64))
     weights = checked_tensor(arrays["weights"], (len(rest), count), "weights", _DO)
     # The parent of the root is arbitrary, 2³² − 1 in most files.

@@ -19,6 +19,7 @@ from invertwin.errors import import_optional
 from invertwin.limits import RADIANS, Positive
 from invertwin.scene.mesh import Mesh
 from invertwin.scene.people.body import BodyTemplate, load_smpl
+from invertwin.scene.pose import Basis
 from invertwin.scene.shape_models.iso_surface import iso_surface
 from invertwin.scene.shape_models.lattice import Lattice
 
@@ -96,9 +97,7 @@ def _weights(points: Float64[Tensor, "p 3"]) -> Float64[Tensor, "p j"]:
 
 _STEP = 0.05  # step of a phenotype for its central difference
 # Anny's bodies face −y, z up; here they face −x, z up.
-_ANNY_TO_BODY_AXES = torch.tensor(
-    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64
-)
+_ANNY_TO_BODY_AXES = Basis((1, 0, 2), (1, -1, 1))
 
 
 def load_anny(
@@ -145,7 +144,7 @@ def _rest(model: Any, values: Mapping[str, float]) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         found = model(pose_parameters=None, phenotype_kwargs=given)
     rest, places = (found[name][0].double() for name in ("rest_vertices", "rest_bone_heads"))
-    return rest @ _ANNY_TO_BODY_AXES.T, places @ _ANNY_TO_BODY_AXES.T
+    return _ANNY_TO_BODY_AXES.vectors(rest), _ANNY_TO_BODY_AXES.vectors(places)
 
 
 Model = Literal["person", "anny"]

@@ -79,9 +79,8 @@ class Sitting(gait.PersonMotion):
         upright = _minimum_jerk((u - _SEAT_CONTACT_SHARE) / (1 - _SEAT_CONTACT_SHARE))
         lean = _LEAN * (lowered - upright)
         shoulder, elbow = (angle * _minimum_jerk(u) for angle in _LAP)
-        pelvis, raised = (
-            gait.rotation_about_axis("y", angle) for angle in (-lean / 2, lean + shoulder)
-        )
+        pelvis = gait.rotation_about_axis("y", -lean / 2)
+        raised = gait.rotation_about_axis("y", lean + shoulder)
         turns = {"pelvis": pelvis, "chest": pelvis}
         for side in ("left", "right"):
             turns |= {
@@ -158,11 +157,9 @@ class Waving(gait.PersonMotion):
         swing = _WAVE * math.sin(2 * math.pi * self.rate * since)
         sign = 1.0 if self.side == "right" else -1.0
         # Held out to the side, forearm upwards: the arm of the rest pose with a bent elbow.
-        raised = {
-            "shoulder": gait.rotation_about_axis("x", 0.0),
-            "elbow": gait.rotation_about_axis("x", sign * (math.pi / 2 + swing)),
-        }
-        for name, turn in raised.items():
+        angles = {"shoulder": 0.0, "elbow": sign * (math.pi / 2 + swing)}
+        for name, angle in angles.items():
+            turn = gait.rotation_about_axis("x", angle)
             row = self.body.joint(f"{self.side}_{name}")
             way = Rotation.from_matrix((found[row].T @ turn).numpy()).as_rotvec()
             found[row] @= torch.from_numpy(Rotation.from_rotvec(up * way).as_matrix())

@@ -38,9 +38,8 @@ class MovingScene:
     motions: Mapping[str, ObjectMotion | Sequence[ObjectMotion]]
 
     def __post_init__(self) -> None:
-        checks.checked_type(
-            self.scene, Scene, "a scene", "build one with Scene({name: Object(...)})"
-        )
+        do = "build one with Scene({name: Object(...)})"
+        checks.checked_type(self.scene, Scene, "a scene", do)
         for name in self.motions:
             if self.scene[name].velocity is not None:
                 raise InputError(
@@ -80,15 +79,13 @@ class AxisRotation:
     center: checks.Point | None = None
 
     def __post_init__(self) -> None:
-        axis = checks.checked_tensor(self.axis, (3,), "axis", "give x, y, z")
+        axis = checks.checked_point(self.axis, "axis")
         if float(axis.norm()) == 0:
             raise InputError("expected an axis with a direction, got zeros; give x, y, z")
         checks.set_fields(self, axis=axis / axis.norm())
         checks.checked_number(self.rate, "rate [rad/s]", -math.inf)
         if self.center is not None:
-            checks.set_fields(
-                self, center=checks.checked_tensor(self.center, (3,), "center [m]", "give x, y, z")
-            )
+            checks.set_fields(self, center=checks.checked_point(self.center, "center [m]"))
 
     def __call__(self, item: Object, time: float) -> Object:
         """Return the object rotated for a time [s].
@@ -121,10 +118,8 @@ class SplineTrajectory:
 
     def __post_init__(self) -> None:
         times = checks.checked_ascending(self.times, "times [s]", "sort the places by time")
-        shape = (len(times), 3)
-        places = checks.checked_tensor(
-            self.positions, shape, "places [m]", "give x, y, z for each time"
-        )
+        shape, do = (len(times), 3), "give x, y, z for each time"
+        places = checks.checked_tensor(self.positions, shape, "places [m]", do)
         from scipy.interpolate import CubicSpline  # slow to import
 
         curve = CubicSpline(times.detach().numpy(), places.detach().numpy(), bc_type="natural")

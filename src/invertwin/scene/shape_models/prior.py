@@ -165,13 +165,10 @@ class ShapePrior:
 
     def save(self, file: str | Path) -> None:
         """Write the prior as ``.npz``, with the network in half precision."""
-        weights = {
-            name: w.numpy().astype(np.float16) for name, w in self.decoder.state_dict().items()
-        }
-        box = {"low": self.low.numpy(), "high": self.high.numpy()}
-        np.savez_compressed(
-            file, format=_FORMAT, counts=np.array(self.lattice.counts), **box, **weights
-        )
+        state = self.decoder.state_dict()
+        weights = {name: w.numpy().astype(np.float16) for name, w in state.items()}
+        box = {name: np.asarray(value) for name, value in vars(self.lattice).items()}
+        np.savez_compressed(file, format=_FORMAT, **box, **weights)
 
     def _surface(self, values: Tensor, target: Lattice) -> tuple[Tensor, Tensor, Tensor]:
         """Return vertices, triangles and the field's gradient, cached for derivatives."""
