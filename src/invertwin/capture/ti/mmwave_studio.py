@@ -7,13 +7,11 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.refusals import refusal
 from invertwin.capture.ti import chirp_table
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["mmwave_studio"]
 
 # Names of the numbers of a profile, and of the frame.
 _PROFILE = chirp_table.FIELDS["studio_profile"]
@@ -67,7 +65,7 @@ def setup_files(path: str | Path) -> list[Path]:
     except (KeyError, TypeError):
         names, base = [], ""
     if not names:
-        raise InputError(_TEXTS["files"].format(path.name))
+        raise refusal("mmwave_studio.files", path.name)
     return [_sibling_path(path, str(PureWindowsPath(base) / name)) for name in names]
 
 
@@ -76,7 +74,7 @@ def _load_json(path: Path) -> dict[str, Any]:
     with convert_read_errors(path, "JSON"):
         content = json.loads(whole, parse_float=Decimal)
     if not isinstance(content, dict):
-        raise InputError(_TEXTS["object"].format(path, type(content).__name__))
+        raise refusal("mmwave_studio.object", path, type(content).__name__)
     return content
 
 
@@ -131,11 +129,11 @@ def _single_device(written: Any) -> dict[str, Any]:
     """The one device of the settings."""
     devices = _list_items(written, "rfConfig")
     if not devices:
-        raise InputError(_TEXTS["no_device"])
+        raise refusal("mmwave_studio.no_device")
     channels = [device["rfConfig"].get("rlChanCfg_t") or {} for device in devices]
     modes = [_parse_integer(own.get("cascading", 0)) for own in channels]
     if any(modes):
-        raise InputError(_TEXTS["cascade"].format(len(devices), ", ".join(map(str, modes))))
+        raise refusal("mmwave_studio.cascade", len(devices), ", ".join(map(str, modes)))
     do = "name a file with the device that recorded alone; give samples of several as arrays"
     _require_equal(len(devices), 1, "settings of one device", do)
     return devices[0]
