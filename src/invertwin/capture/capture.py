@@ -309,10 +309,9 @@ class Capture:
         """
         shift = torch.tensor(clock_offset - self.clock_offset, dtype=torch.float64)
         ranges = self.ranges + (self.range_bias - range_bias)
-        dataset = self.dataset.assign(
-            position=to_data_array(("frame", "axis"), self.positions(shift), "m"),
-            range=to_data_array(("range",), ranges, "m"),
-        )
+        position = to_data_array(("frame", "axis"), self.positions(shift), "m")
+        shifted = to_data_array(("range",), ranges, "m")
+        dataset = self.dataset.assign(position=position, range=shifted)
         named = {"clock_offset": clock_offset, "range_bias": range_bias}
         return Capture(dataset.assign_attrs(named))
 

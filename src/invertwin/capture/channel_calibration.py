@@ -19,7 +19,7 @@ from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
 RecordingT = TypeVar("RecordingT", bound=Capture | ChirpCapture)
@@ -80,8 +80,8 @@ class ChannelCalibration:
         Raises:
             InputError: the folder does not exist.
         """
-        with replace_file(path) as part:
-            part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
+        content = {"gains": torch.view_as_real(self.gains).tolist()}
+        write_text_file(path, json.dumps(content) + "\n")
 
     def apply(self, capture: RecordingT) -> RecordingT:
         """The recording with every channel divided by its gain.

@@ -92,10 +92,9 @@ class ChirpSettings:
         if self.channel_factors:
             do = "give (real, imaginary) for every receiver of every transmitter of the device"
             table = checked_tensor(self.channel_factors, (None, None, 2), "channel factors", do)
-            if len(table) < max(order) or table.shape[1] < max(receivers):
-                raise refusal(
-                    "chirps.factors", max(order), max(receivers), tuple(table.shape[:2]), do
-                )
+            sizes = tuple(table.shape[:2])
+            if sizes[0] < max(order) or sizes[1] < max(receivers):
+                raise refusal("chirps.factors", max(order), max(receivers), sizes, do)
 
     @property
     def correction(self) -> Complex[Tensor, "tx rx #sample"]:
@@ -116,9 +115,7 @@ class ChirpSettings:
     @property
     def ramp_time(self) -> float:
         """From the start of a ramp to its end [s]."""
-        if self.ramp_end_time is not None:
-            return self.ramp_end_time
-        return self.adc_start_time + self.samples / self.sample_rate
+        return self.ramp_end_time or self.adc_start_time + self.samples / self.sample_rate
 
     @property
     def chirps(self) -> Chirps:

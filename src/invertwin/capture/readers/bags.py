@@ -4,8 +4,9 @@ The package rosbags reads them, which is plain Python; the extra ``ros`` install
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -108,11 +109,9 @@ def read_track(path: str | Path, topic: str) -> Track:
 
     def read_position(message: Any) -> list[float]:
         for name in _POSITION_FIELDS:
-            held = message
-            for part in name.split("."):
-                held = getattr(held, part, None)
-            if held is not None:
-                return [held.x, held.y, held.z]
+            with suppress(AttributeError):
+                place = attrgetter(name)(message)
+                return [place.x, place.y, place.z]
         raise refusal("bags.poses", topic, message.__msgtype__)
 
     found = dict(_read_messages(path, topic, read_position))

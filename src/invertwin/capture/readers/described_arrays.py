@@ -23,7 +23,7 @@ from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.runtime.memory import require_memory
 from invertwin.scene.antenna import AntennaArray
 from invertwin.storage import untrusted
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import replace_file, write_text_file
 from invertwin.storage.isolated_reader import read_isolated
 
 # The data tell these settings by their shape and kind.
@@ -67,11 +67,8 @@ def load_described_board(
             raise refusal("described_arrays.board", path, "neither" if board is None else "both")
         if board is None:
             return element_array(tx, "TX", axes), element_array(rx, "RX", axes)
-    return Mounting(
-        board,
-        described.get("elevation") if elevation is None else elevation,
-        described.get("azimuth", 1) if azimuth is None else azimuth,
-    )
+    elevation = described.get("elevation") if elevation is None else elevation
+    return Mounting(board, elevation, described.get("azimuth", 1) if azimuth is None else azimuth)
 
 
 @untrusted.safe_reader("samples as their description says")
@@ -112,9 +109,8 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     path = Path(path)
     description, _ = _load_chirp_description(path)
     data, given = description["data"], description["settings"]
-    array = load_array(
-        untrusted.named_file(path, str(data["file"])), data.get("variable"), trusted=trusted
-    )
+    file = untrusted.named_file(path, str(data["file"]))
+    array = load_array(file, data.get("variable"), trusted=trusted)
     order = data.get("dimensions", list(CHIRP_DIMS))
     real = array.dtype.kind != "c" and "iq" not in order
     if real and _are_powers(array):
@@ -191,8 +187,7 @@ def write_chirps(
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
         description["radar"] = {"tx_positions": tx, "rx_positions": rx}
-    with replace_file(path) as part:
-        part.write_text(tomli_w.dumps(description), encoding="utf-8")
+    write_text_file(path, tomli_w.dumps(description))
 
 
 def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
@@ -244,9 +239,8 @@ def load_description(
         if known is None or not isinstance(given, dict) or not set(given) <= known:
             others = sorted(set(given) - known) if known and isinstance(given, dict) else given
             wrong = f"[{section}]" if known is None else f"{others!r} in [{section}]"
-            raise refusal(
-                "described_arrays.keys", ", ".join(keys), path.name, wrong, sorted(known or keys)
-            )
+            names = sorted(known or keys)
+            raise refusal("described_arrays.keys", ", ".join(keys), path.name, wrong, names)
     if frame is not None:
         return description, [0, 1, 2]
     places = ", ".join(sorted(_PLACES.intersection(description.get("radar", {}))))

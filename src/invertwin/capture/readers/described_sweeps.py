@@ -110,12 +110,9 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
         description, axes = described_arrays.load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
     files = _find_data_files(path, data)
-    tx, rx = (
-        described_arrays.element_array(
-            radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes
-        )
-        for end in ("tx", "rx")
-    )
+    origin = [[0.0, 0.0, 0.0]]
+    tx = described_arrays.element_array(radar.get("tx_positions", origin), "TX", axes)
+    rx = described_arrays.element_array(radar.get("rx_positions", origin), "RX", axes)
     source = _SweepFile(files[0], trusted)
     if TOUCHSTONE.fullmatch(files[0].suffix):
         frequencies, beat = _load_touchstone_sweeps(files, sweep, path)
@@ -279,9 +276,8 @@ def _read_position_rows(file: Path) -> list[list[float]]:
         mark = next((m for m in ";\t" if m in head), ",")
         if mark == ";":  # where commas are decimal marks
             lines = [line.replace(",", ".") for line in lines]
-        names = [
-            re.sub(r"[\[(]m[\])]$", "", name.strip()).strip().lower() for name in head.split(mark)
-        ]
+        heads = (name.strip() for name in head.split(mark))
+        names = [re.sub(r"[\[(]m[\])]$", "", name).strip().lower() for name in heads]
         table = csv.DictReader(lines, names, delimiter=mark)
         return [[float(row[axis]) for axis in "xyz"] for row in table]
 

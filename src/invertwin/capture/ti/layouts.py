@@ -52,15 +52,13 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
     Raises:
         InputError: Another name, or values that settings cannot have.
     """
+    values = dict(changes)
     for name in changes:
         do = "correct other numbers in the settings file"
         check_choice(name, CHANGEABLE_SETTINGS, "changes of", do)
-    values = {
-        _COUNTS.get(name, name): tuple(range(1, checked_count(value, name, 1) + 1))
-        if name in _COUNTS
-        else value
-        for name, value in changes.items()
-    }
+        if name in _COUNTS:
+            count = checked_count(values.pop(name), name, 1)
+            values[_COUNTS[name]] = tuple(range(1, count + 1))
     return replace(settings, **values)
 
 

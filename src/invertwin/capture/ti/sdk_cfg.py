@@ -11,7 +11,7 @@ from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.capture.ti import chirp_table, device_limits
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import read_text, safe_reader
 
 # What commands mean to samples: fewest arguments, required values, and what is ignored on purpose.
@@ -76,9 +76,8 @@ def _check_command(number: int, command: str, *arguments: str) -> None:
     for rule in chirp_table.FIELDS["required"]:
         given = arguments[rule["place"] :][:1] if rule["command"] == command else ()
         if given and given[0] not in rule["values"]:
-            raise InputError(
-                f"expected {' or '.join(rule['values'])}, got {given[0]} in {line}; {rule['why']}"
-            )
+            allowed = " or ".join(rule["values"])
+            raise InputError(f"expected {allowed}, got {given[0]} in {line}; {rule['why']}")
 
 
 def _compare_transmitters(profiles: list[list[str]], order: tuple[int, ...]) -> list[str]:
@@ -161,5 +160,4 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings, device: str = "")
     calibration = " ".join(map(chirp_table.format_decimal, numbers))
     text = chirp_table.fill_file("cfg", s, "d", "\n", calibration=calibration)
     named = f"% Platform:xWR{family}xx\n" if s.lanes else ""
-    with replace_file(path) as part:
-        part.write_text(named + text, encoding="utf-8")
+    write_text_file(path, named + text)
