@@ -11,7 +11,7 @@ def refusal(name: str, *values: Any) -> InputError:
 
     Args:
         name: Section and key of refusals.toml, such as ``capture.sizes``.
-        *values: What its text leaves open.
+        values: What its text leaves open.
     """
     return InputError(refusal_text(name, *values))
 
@@ -21,7 +21,7 @@ def refusal_text(name: str, *values: Any) -> str:
 
     Args:
         name: Section and key of refusals.toml, such as ``capture.sizes``.
-        *values: What the text leaves open.
+        values: What the text leaves open.
     """
     section, key = name.split(".")
     return read_table("invertwin.capture", "refusals.toml")[section][key].format(*values)
