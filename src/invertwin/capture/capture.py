@@ -24,10 +24,10 @@ from invertwin.capture.readers.radar_fields import (
     to_data_array,
     write_dataset,
 )
+from invertwin.capture.refusals import refusal
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
-from invertwin.constants import SPEED_OF_LIGHT, read_table
-from invertwin.errors import InputError
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_samples
 from invertwin.radar.processing.beamforming import exact_spectrum
@@ -35,7 +35,6 @@ from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
 from invertwin.storage.untrusted import convert_read_errors
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["capture"]
 _Profiles = Complex[Tensor, "frame range"]
 BeatUnit = Literal["1", "count"]
 
@@ -79,7 +78,7 @@ class RangeInterpolator:
         """
         low, high = float(ranges.min()), float(ranges.max())
         if low < self._first - 1e-9 or high > self._last + 1e-9:
-            raise InputError(_TEXTS["profile_limits"].format(self._first, self._last, low, high))
+            raise refusal("capture.profile_limits", self._first, self._last, low, high)
         offset = ranges - self._first
         value = interpolate_samples(self._samples, offset / self._step)
         return value * torch.polar(torch.ones_like(offset), self._wavenumber * offset)
@@ -136,7 +135,7 @@ class Capture:
         samples = torch.from_numpy(beat) if isinstance(beat, np.ndarray) else beat
         if not isinstance(samples, Tensor) or not samples.is_complex():
             got = samples.dtype if isinstance(samples, Tensor) else type(samples).__name__
-            raise InputError(_TEXTS["real_samples"].format(got))
+            raise refusal("capture.real_samples", got)
         return cls._assemble({"beat": to_data_array(BEAT_DIMS, samples, unit)}, radar, times)
 
     @classmethod
@@ -295,7 +294,7 @@ class Capture:
         """
         track = self.track
         if track is None:
-            raise InputError(_TEXTS["no_track"])
+            raise refusal("capture.no_track")
         return track.interpolate(self.times + (self.clock_offset + clock_shift))
 
     def recalibrate(self, clock_offset: float, range_bias: float) -> "Capture":
@@ -310,10 +309,9 @@ class Capture:
         """
         shift = torch.tensor(clock_offset - self.clock_offset, dtype=torch.float64)
         ranges = self.ranges + (self.range_bias - range_bias)
-        dataset = self.dataset.assign(
-            position=to_data_array(("frame", "axis"), self.positions(shift), "m"),
-            range=to_data_array(("range",), ranges, "m"),
-        )
+        position = to_data_array(("frame", "axis"), self.positions(shift), "m")
+        shifted = to_data_array(("range",), ranges, "m")
+        dataset = self.dataset.assign(position=position, range=shifted)
         named = {"clock_offset": clock_offset, "range_bias": range_bias}
         return Capture(dataset.assign_attrs(named))
 
@@ -334,7 +332,7 @@ class Capture:
         if "beat" in self.dataset:
             return exact_spectrum(self.beat, self._radar, grid)
         if grid.shape[1:] != (1, 1):
-            raise InputError(_TEXTS["directions"].format(grid.u_count, grid.v_count))
+            raise refusal("capture.directions", grid.u_count, grid.v_count)
         profile = self.interpolator()(grid.ranges.expand(self.frame_count, -1))
         return profile.abs().square()[..., None, None]
 
@@ -346,7 +344,7 @@ class Capture:
     def _read_data(self, name: str) -> Tensor:
         if name not in self.dataset:
             held = "beat" if "beat" in self.dataset else "range_profile"
-            raise InputError(_TEXTS["other_data"].format(name, held))
+            raise refusal("capture.other_data", name, held)
         return read_tensor(self.dataset, name)
 
 
@@ -357,21 +355,21 @@ def _check_sizes(variables: dict[str, xr.DataArray]) -> None:
         for dim, size in zip(variable.dims, variable.shape, strict=True):
             other, expected = sizes.setdefault(str(dim), (name, size))
             if size != expected:
-                raise InputError(_TEXTS["sizes"].format(expected, dim, name, other, size))
+                raise refusal("capture.sizes", expected, dim, name, other, size)
 
 
 def _check_dataset(dataset: xr.Dataset) -> Radar:
     """Check a dataset, and return its radar."""
     held = [name for name in ("beat", "range_profile") if name in dataset]
     if len(held) != 1:
-        raise InputError(_TEXTS["no_data"].format(held or "neither"))
+        raise refusal("capture.no_data", held or "neither")
     data, dims = dataset[held[0]], BEAT_DIMS if "beat" in held else PROFILE_DIMS
     if data.dims != dims or data.dtype.kind != "c":
-        raise InputError(_TEXTS["kind"].format(held[0], dims, data.dtype, data.dims))
+        raise refusal("capture.kind", held[0], dims, data.dtype, data.dims)
     for name, variable in dataset.variables.items():
         bad = int((~(np.abs(variable.values) <= MAX_NUMBER)).sum())
         if bad:
-            raise InputError(_TEXTS["not_finite"].format(name, bad, variable.size))
+            raise refusal("capture.not_finite", name, bad, variable.size)
     radar = radar_from_fields(dataset)
     if "beat" in held:
         _check_beat(dataset, radar)
@@ -384,13 +382,13 @@ def _check_beat(dataset: xr.Dataset, radar: Radar) -> None:
     waveform, got = radar.waveform, dataset.sizes["sample"]
     expected = waveform.samples if isinstance(waveform, SampledWaveform) else None
     if expected != got:
-        raise InputError(_TEXTS["samples"].format(expected, type(waveform).__name__, got))
+        raise refusal("capture.samples", expected, type(waveform).__name__, got)
 
 
 def _check_profile(dataset: xr.Dataset) -> None:
     steps = read_tensor(dataset, "range").diff()
     if not len(steps) or not ((steps / steps.mean() - 1).abs() <= 1e-3).all() or steps[0] <= 0:
-        raise InputError(_TEXTS["ranges"])
+        raise refusal("capture.ranges")
     for end in ("tx", "rx"):
         if dataset.sizes[end] != 1:
-            raise InputError(_TEXTS["elements"].format(end, dataset.sizes[end]))
+            raise refusal("capture.elements", end, dataset.sizes[end])

@@ -12,16 +12,16 @@ from torch import Tensor
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.readers.radar_fields import to_data_array
+from invertwin.capture.refusals import refusal
 from invertwin.checks import check_shape, checked_tensor
-from invertwin.constants import SPEED_OF_LIGHT, read_table
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["channel_calibration"]
 RecordingT = TypeVar("RecordingT", bound=Capture | ChirpCapture)
 _MIN_RELATIVE_GAIN = 1e-3
 
@@ -45,11 +45,11 @@ class ChannelCalibration:
         gains = self.gains
         finite = bool(gains.numel()) and bool((gains.abs() <= MAX_NUMBER).all())
         if gains.ndim != 2 or not finite:
-            raise InputError(_TEXTS["gains"].format(tuple(gains.shape)))
+            raise refusal("channel_calibration.gains", tuple(gains.shape))
         weak = gains.abs() < _MIN_RELATIVE_GAIN * gains.abs().max()
         if bool(weak.any()):
             tx, rx = (int(index) for index in weak.nonzero()[0])
-            raise InputError(_TEXTS["weak_channel"].format(_MIN_RELATIVE_GAIN, tx, rx))
+            raise refusal("channel_calibration.weak_channel", _MIN_RELATIVE_GAIN, tx, rx)
         gains = gains / gains.abs().square().mean().sqrt()
         total = gains.sum()
         # Phases that cancel have no common one.
@@ -80,8 +80,8 @@ class ChannelCalibration:
         Raises:
             InputError: the folder does not exist.
         """
-        with replace_file(path) as part:
-            part.write_text(json.dumps({"gains": torch.view_as_real(self.gains).tolist()}) + "\n")
+        content = {"gains": torch.view_as_real(self.gains).tolist()}
+        write_text_file(path, json.dumps(content) + "\n")
 
     def apply(self, capture: RecordingT) -> RecordingT:
         """The recording with every channel divided by its gain.
@@ -129,7 +129,7 @@ def estimate_channels(
     delay = delay - radar.origin_delays[:, None, None]
     farthest = float(delay.max()) * SPEED_OF_LIGHT / 2
     if farthest >= radar.range_limits[1]:
-        raise InputError(_TEXTS["reflector"].format(radar.range_limits[1], farthest, do))
+        raise refusal("channel_calibration.reflector", radar.range_limits[1], farthest, do)
     cycles = waveform.frequencies * delay[..., None]
     cycles = cycles - 0.5 * waveform.residual_slope * delay.square()[..., None]
     ideal = torch.exp(2j * torch.pi * cycles)

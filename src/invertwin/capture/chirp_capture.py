@@ -8,13 +8,10 @@ from jaxtyping import Complex, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import BeatUnit, Capture
+from invertwin.capture.refusals import refusal
 from invertwin.checks import check_shape
-from invertwin.constants import read_table
-from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["chirp_capture"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +44,7 @@ class ChirpCapture:
         expected = (frames, self.chirps.count, *elements)
         shape = tuple(self.beat.shape)
         if not self.beat.is_complex() or shape[:-1] != expected:
-            raise InputError(_TEXTS["samples"].format(expected, self.beat.dtype, shape))
+            raise refusal("chirp_capture.samples", expected, self.beat.dtype, shape)
 
     def radar(self) -> Radar:
         """The radar at the poses of the frames."""
@@ -95,7 +92,7 @@ class ChirpCapture:
         """
         wrong = [number for number in numbers if not 0 <= number < self.frame_count]
         if wrong:
-            raise InputError(_TEXTS["frame"].format(self.frame_count, wrong[0]))
+            raise refusal("chirp_capture.frame", self.frame_count, wrong[0])
         return replace(self, beat=self.beat[list(numbers)], device=self.device.frames(numbers))
 
     def with_poses(
@@ -132,10 +129,10 @@ class ChirpCapture:
         count = self.chirps.count
         if chirp == "mean":
             if self.moving:
-                raise InputError(_TEXTS["mean"])
+                raise refusal("chirp_capture.mean")
             beat = self.beat.mean(dim=1)
         elif isinstance(chirp, bool) or not isinstance(chirp, int) or not 0 <= chirp < count:
-            raise InputError(_TEXTS["chirps"].format(count - 1, chirp))
+            raise refusal("chirp_capture.chirps", count - 1, chirp)
         else:
             beat = self.beat[:, chirp]
         times = None

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from invertwin import limits
 from invertwin.capture.chirp_capture import ChirpCapture
+from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.checks import check_fields, check_shape, check_some, checked_number, checked_tensor
-from invertwin.constants import SPEED_OF_LIGHT, read_table
+from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
@@ -24,7 +25,6 @@ from invertwin.radar.signal.chirps import Chirps, check_order
 from invertwin.radar.waveform import FMCW, PhysicsWarning
 from invertwin.runtime.memory import require_memory
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["chirps"]
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")
 IdleTime = Annotated[limits.NonNegative, limits.UsualValue("seconds", 5e-6, high=1.0)]
 
@@ -82,20 +82,19 @@ class ChirpSettings:
         check_fields(self)
         order, receivers = self.transmit_order, self.receivers
         if not order or min(order) < 1 or len(set(order)) < len(order):
-            raise InputError(_TEXTS["order"].format(order))
+            raise refusal("chirps.order", order)
         if not receivers or min(receivers) < 1 or list(receivers) != sorted(set(receivers)):
-            raise InputError(_TEXTS["receivers"].format(receivers))
+            raise refusal("chirps.receivers", receivers)
         last = self.adc_start_time + self.samples / self.sample_rate
         if self.ramp_end_time is not None and self.ramp_end_time < last * (1 - 1e-9):
-            raise InputError(_TEXTS["ramp"].format(last, self.ramp_end_time))
+            raise refusal("chirps.ramp", last, self.ramp_end_time)
         object.__setattr__(self, "channel_factors", tuple(self.channel_factors))
         if self.channel_factors:
             do = "give (real, imaginary) for every receiver of every transmitter of the device"
             table = checked_tensor(self.channel_factors, (None, None, 2), "channel factors", do)
-            if len(table) < max(order) or table.shape[1] < max(receivers):
-                raise InputError(
-                    _TEXTS["factors"].format(max(order), max(receivers), tuple(table.shape[:2]), do)
-                )
+            sizes = tuple(table.shape[:2])
+            if sizes[0] < max(order) or sizes[1] < max(receivers):
+                raise refusal("chirps.factors", max(order), max(receivers), sizes, do)
 
     @property
     def correction(self) -> Complex[Tensor, "tx rx #sample"]:
@@ -116,9 +115,7 @@ class ChirpSettings:
     @property
     def ramp_time(self) -> float:
         """From the start of a ramp to its end [s]."""
-        if self.ramp_end_time is not None:
-            return self.ramp_end_time
-        return self.adc_start_time + self.samples / self.sample_rate
+        return self.ramp_end_time or self.adc_start_time + self.samples / self.sample_rate
 
     @property
     def chirps(self) -> Chirps:
@@ -167,7 +164,7 @@ class ChirpData:
         top = 2 ** (self.settings.bits - 1) - 1
         count = int(((parts >= top) | (parts <= -top - 1)).any(dim=-1).sum())
         if count:
-            text = _TEXTS["saturation"].format(count, self.samples.numel(), top)
+            text = refusal_text("chirps.saturation", count, self.samples.numel(), top)
             warnings.warn(text, PhysicsWarning, stacklevel=3)
 
     @property
@@ -208,7 +205,7 @@ class ChirpData:
             board = board.arrays(settings.transmit_order, settings.receivers)
         for name, array, count in zip(("TX", "RX"), board, self.samples.shape[2:4], strict=True):
             if len(array.positions) != count:
-                raise InputError(_TEXTS["elements"].format(count, name, len(array.positions)))
+                raise refusal("chirps.elements", count, name, len(array.positions))
         if positions is None:
             positions = torch.zeros(self.frame_count, 3, dtype=torch.float64)
         radar = Radar(*board, settings.waveform, positions, rotations)

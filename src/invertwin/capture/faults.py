@@ -275,10 +275,8 @@ def detect_ghosts(
     """
     count = rates.shape[-1]
     tapered, mirrored = (part * _blackman_harris_window(count) for part in (rates, opposite))
-    power, power_of_mirrored = (
-        torch.fft.fft(part, 4 * count).abs().square().flatten(0, 1).mean(0)
-        for part in (tapered, mirrored)
-    )
+    spectra = (torch.fft.fft(part, 4 * count).flatten(0, 1) for part in (tapered, mirrored))
+    power, power_of_mirrored = (spectrum.abs().square().mean(0) for spectrum in spectra)
     looks, top = rates.shape[0] * rates.shape[1], float(power.max())
     own_half = power[: 2 * count] if real else power
     noise = max(noise_power(own_half, looks, _NOISE_ONLY_FRACTION), _WINDOW_FLOOR * top)

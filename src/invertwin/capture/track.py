@@ -6,11 +6,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from invertwin.capture.refusals import refusal
 from invertwin.checks import checked_ascending, checked_tensor
-from invertwin.constants import read_table
-from invertwin.errors import InputError
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["track"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class Track:
         first, last = float(self.times[0]), float(self.times[-1])
         asked = times.detach()
         if bool((asked < first).any()) or bool((asked > last).any()):
-            raise InputError(_TEXTS["times"].format(first, last, *asked.aminmax()))
+            raise refusal("track.times", first, last, asked.min(), asked.max())
         after = torch.searchsorted(self.times, asked).clamp(1, len(self.times) - 1)
         start, end = self.times[after - 1], self.times[after]
         part = (times - start) / (end - start)

@@ -67,19 +67,11 @@ def argument(text: str) -> Any:
     return typer.Argument(help=text, show_default=False)
 
 
-BackendOption = Annotated[
-    Literal["auto", "cpu", "cuda"] | None,
-    option(
-        "--backend",
-        "Where rays are traced; default: INVERTWIN_BACKEND, else auto.",
-        callback=_use_backend,
-        show_default=False,
-    ),
-]
-EngineOption = Annotated[
-    Literal["processes", "ray"],
-    option("--engine", "Processes of this machine, or tasks of a Ray cluster."),
-]
+_BACKEND_HELP = "Where rays are traced; default: INVERTWIN_BACKEND, else auto."
+_backend = option("--backend", _BACKEND_HELP, callback=_use_backend, show_default=False)
+BackendOption = Annotated[Literal["auto", "cpu", "cuda"] | None, _backend]
+_engine = option("--engine", "Processes of this machine, or tasks of a Ray cluster.")
+EngineOption = Annotated[Literal["processes", "ray"], _engine]
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1)]
 FileArgument = Annotated[Path, argument("Run file (TOML).")]
 FilesArgument = Annotated[list[Path], argument("Run files (TOML).")]

@@ -122,9 +122,8 @@ def rcs_curves(
     for axes, (title, curves) in zip(rows, panels.items(), strict=True):
         top = max(float(np.nanmax(numbers(curve))) for curve in curves.values())
         _lines(axes, curves, across)
-        axes.set(
-            title=legible(title), xlabel=label, ylabel="RCS [dBsm]", ylim=(top - least, top + 3)
-        )
+        ends = (top - least, top + 3)
+        axes.set(title=legible(title), xlabel=label, ylabel="RCS [dBsm]", ylim=ends)
     return figure
 
 

@@ -92,9 +92,8 @@ def png_bytes(figure: Figure) -> bytes:
         if same_color(artist.get_color(), "black"):
             artist.set_color(_INK)
     # Black behind echoes stays.
-    for patch in [axes.patch for axes in figure.axes] + [
-        x.get_frame() for x in figure.findobj(Legend)
-    ]:
+    frames = [legend.get_frame() for legend in figure.findobj(Legend)]
+    for patch in [*(axes.patch for axes in figure.axes), *frames]:
         if same_color(patch.get_facecolor()[:3], "white"):
             patch.set_facecolor("none")
     buffer = io.BytesIO()

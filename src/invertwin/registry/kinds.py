@@ -308,9 +308,8 @@ class Registry:
             own = next((b for kind, b in self.bases.items() if issubclass(product, kind)), base)
             base = base if issubclass(base, own) else _combine_tables(own, base)
         for name, parameter in inspect.signature(make).parameters.items():
-            if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-                continue
-            if name in without:
+            is_variadic = parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+            if is_variadic or name in without:
                 continue
             hint = hints[name]
             if self.given & set(_union_members(hint)):
@@ -472,10 +471,8 @@ def number_or_list(*kinds: Any) -> Any:
         bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
         if get_origin(bare) is list:
             return "list"
-        table = get_origin(bare) is dict or (
-            isinstance(bare, type) and issubclass(bare, section.Section)
-        )
-        return "table" if table else "number"
+        is_section = isinstance(bare, type) and issubclass(bare, section.Section)
+        return "table" if is_section or get_origin(bare) is dict else "number"
 
     tags = [tag(kind) for kind in kinds]
 
@@ -484,9 +481,7 @@ def number_or_list(*kinds: Any) -> Any:
         kind = "list" if isinstance(value, list) else kind
         return section.TAG_MARK + (kind if kind in tags else tags[0])
 
-    members = [
-        Annotated[k, Tag(section.TAG_MARK + name)] for k, name in zip(kinds, tags, strict=True)
-    ]
+    members = [Annotated[kind, Tag(section.TAG_MARK + tag(kind))] for kind in kinds]
     return Annotated[_union_type(members), Discriminator(form)]
 
 

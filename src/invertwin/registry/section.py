@@ -31,16 +31,18 @@ TAG_MARK = "→"
 
 _MAX_UNKNOWN = 20  # keys that errors name
 
+# In docstrings: descriptions of all arguments, and of one or of several together.
+_ARGUMENTS = re.compile(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", re.MULTILINE)
+_ARGUMENT = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
+
 # Beside the checkout; for an installed package this is a folder that does not exist.
 _CHECKOUT_DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 def _resolve_input_path(name: str, info: Any) -> str:
     """Relative paths start at the run file's folder, then at the data folder."""
-    folders = [
-        (info.context or {}).get("folder", Path()),
-        os.environ.get("INVERTWIN_DATA", _CHECKOUT_DATA),
-    ]
+    beside = (info.context or {}).get("folder", Path())
+    folders = (beside, os.environ.get("INVERTWIN_DATA", _CHECKOUT_DATA))
     paths = [Path(folder, name).absolute() for folder in folders]
     return str(next(filter(os.path.exists, paths), paths[0]))
 
@@ -140,10 +142,8 @@ def argument_docs(make: Any) -> dict[str, str]:
     for owner in owners:
         texts = [owner.__doc__, owner.__init__.__doc__ if isinstance(make, type) else None]
         for text in map(inspect.cleandoc, filter(None, texts)):
-            for part in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", text, re.M):
-                for names, words in re.findall(
-                    r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", part, re.M
-                ):
+            for part in _ARGUMENTS.findall(text):
+                for names, words in _ARGUMENT.findall(part):
                     for name in names.split(", "):
                         found.setdefault(name, " ".join(words.split()).removesuffix("."))
     return found
@@ -210,9 +210,8 @@ def require_section(run: Any, section: str, command: str, otherwise: str = "add 
     if observed and all(getattr(table, section, None) for table in observed):
         return found
     if found in (None, []):
-        raise InputError(
-            f"expected a section [{section}] for {command}, got a run file without one; {otherwise}"
-        )
+        said = f"expected a section [{section}] for {command}, got a run file without one"
+        raise InputError(f"{said}; {otherwise}")
     return found
 
 

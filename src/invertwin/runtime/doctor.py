@@ -230,9 +230,8 @@ def gpu_name() -> str | None:
     except OSError:
         return None
     device, name = ctypes.c_int(), ctypes.create_string_buffer(128)
-    if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0):
-        return None
-    if driver.cuDeviceGetName(name, len(name), device):
+    found = not (driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0))
+    if not found or driver.cuDeviceGetName(name, len(name), device):
         return None
     return name.value.decode(errors="replace")
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -103,14 +104,11 @@ def _processes(workers: int) -> Iterator[tuple[int, Any, Any]]:
         ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(alive,)) as pool,
     ):
 
-        def submit(work: Any, job: Any) -> Any:
-            return pool.submit(_run_guarded, work, job)
-
         def wait_for_results(pending: Any) -> list[tuple[Any, Any]]:
             return [(f, f.result()) for f in wait(pending, return_when=FIRST_COMPLETED).done]
 
         try:
-            yield workers, submit, wait_for_results
+            yield workers, partial(pool.submit, _run_guarded), wait_for_results
         except BaseException as error:
             ours.close()
             if not isinstance(error, BrokenProcessPool):

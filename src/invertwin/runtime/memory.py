@@ -2,12 +2,13 @@
 
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from invertwin.errors import InputError
-from invertwin.runtime.control_groups import group_folders
+from invertwin.runtime.control_groups import group_folders, read_text
 
 _DEFAULT_MEMORY = 16e9  # where the system does not say
 _UNLIMITED = 1 << 60  # larger limits are none
@@ -67,9 +68,8 @@ def require_at_most(count: float, maximum: float, what: str, do: str, at: str = 
         InputError: More than that, or not a number.
     """
     if not count <= maximum:
-        raise InputError(
-            f"expected at most {maximum:,.0f} {what}, got {min(count, 1e300):.3g}; {do}", at
-        )
+        got = f"{min(count, 1e300):.3g}"
+        raise InputError(f"expected at most {maximum:,.0f} {what}, got {got}; {do}", at)
 
 
 def format_gigabytes(count: float) -> str:
@@ -79,13 +79,8 @@ def format_gigabytes(count: float) -> str:
 
 def _read_stated_bytes(file: str, name: str) -> float | None:
     """Return the bytes that Linux states in a line of a file; None without file or line."""
-    try:
-        for line in Path(file).read_text().splitlines():
-            if line.startswith(f"{name}:"):
-                return 1024.0 * int(line.split()[1])
-    except OSError:
-        pass
-    return None
+    stated = re.search(rf"^{name}:\s*(\d+)", read_text(Path(file)), re.MULTILINE)
+    return 1024.0 * int(stated[1]) if stated else None
 
 
 def _machine_memory() -> float:

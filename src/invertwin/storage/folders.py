@@ -63,6 +63,20 @@ def replace_file(path: str | Path) -> Generator[Path]:
         part.unlink(missing_ok=True)
 
 
+def write_text_file(path: str | Path, text: str) -> None:
+    """Write a text as UTF-8, in the way of `replace_file`.
+
+    Args:
+        path: the file, in an existing folder.
+        text: its content.
+
+    Raises:
+        InputError: no such folder.
+    """
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def convert_os_errors(do: str) -> Iterator[None]:
     """Tell what the file system refuses as an InputError, with more that one can do."""
@@ -139,8 +153,7 @@ def save_manifest(path: Path, manifest: Manifest) -> None:
         path: Path of the folder.
         manifest: Content of the manifest.
     """
-    with replace_file(path / MANIFEST) as part:
-        part.write_text(manifest.model_dump_json(indent=1), encoding="utf-8")
+    write_text_file(path / MANIFEST, manifest.model_dump_json(indent=1))
 
 
 def path_in_folder(path: Path, name: str) -> Path:

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -86,14 +87,11 @@ def read_isolated(
     seconds, memory = _SECONDS + size / _BYTES_PER_SECOND, _MEMORY + 4 * size
     # -P: the reader's libraries are those of this process, not what lies in the folder.
     call = [sys.executable, "-P", "-c", _CHILD, kind, os.fspath(path), variable]
+    call += [str(memory), str(int(seconds))]
     known = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
     try:
-        ended = subprocess.run(
-            [*call, str(memory), str(int(seconds))],
-            capture_output=True,
-            timeout=_TIMEOUT_FACTOR * seconds,
-            env=known,
-        )
+        limit = _TIMEOUT_FACTOR * seconds
+        ended = subprocess.run(call, capture_output=True, timeout=limit, env=known)
         code, said = ended.returncode, ended.stdout
     except subprocess.TimeoutExpired:
         code, said = _TIMED_OUT, b""
@@ -123,11 +121,9 @@ def run_child_reader(kind: str, path: str, variable: str, memory: str, seconds: 
         memory: Address space [bytes].
         seconds: Processor time [s].
     """
-    try:
+    with suppress(ImportError):  # Windows has no such limits; the parent limits the time
         import resource
-    except ImportError:  # Windows has no such limits; the parent limits the time
-        pass
-    else:
+
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import os
 import platform
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,8 @@ from fnmatch import fnmatchcase
 from glob import escape
 from pathlib import Path
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 from invertwin.errors import InputError
 from invertwin.storage import folders
@@ -233,12 +234,8 @@ def _resumable(path: Path, manifest: folders.Manifest) -> bool:
 
 def to_json_value(value: Any) -> Any:
     """A value as JSON can hold it: tensors and arrays as lists, non-finite numbers as None."""
-    if isinstance(value, Mapping):
-        return {str(key): to_json_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_json_value(item) for item in value]
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return to_json_value(value.tolist()) if hasattr(value, "tolist") else str(value)
+
+    def convert(other: Any) -> Any:
+        return other.tolist() if hasattr(other, "tolist") else str(other)
+
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=convert)

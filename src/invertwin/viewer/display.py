@@ -103,17 +103,17 @@ class DisplayMaps:
 
     @classmethod
     def from_spectra(
-        cls, spectra: Mapping[str, Tensor], grid: Grid, max_values: int = _MAX_VALUES
+        cls, spectra: Mapping[str, Tensor], grid: Grid, max_values: int | None = None
     ) -> "DisplayMaps":
         """Maps of spectra [frame, range, u, v]; of many frames, evenly chosen ones.
 
         Args:
             spectra: By what is shown, all of one shape.
             grid: Their bins.
-            max_values: Values that are kept, about.
+            max_values: Values that are kept, about; None = of a few megabytes.
         """
         frames, ranges, across, _ = next(iter(spectra.values())).shape
-        count = max(1, min(frames, max_values // (len(spectra) * ranges * across)))
+        count = max(1, min(frames, (max_values or _MAX_VALUES) // (len(spectra) * ranges * across)))
         chosen = np.unique(np.linspace(0, frames - 1, count).astype(int)).tolist()
         tops = {name: power.detach()[chosen].amax(3).cpu() for name, power in spectra.items()}
         kept = {name: np.asarray(power, np.float32) for name, power in tops.items()}

@@ -128,14 +128,13 @@ def is_valid_message(raw: Any, controls: Mapping[str, Any]) -> bool:
     """
     import msgspec  # comes with viser
 
-    try:
+    # Text, or no message.
+    with suppress(TypeError, ValueError, RecursionError, msgspec.DecodeError):
         match msgspec.msgpack.decode(raw):
             case {"type": "GuiUpdateMessage", "uuid": str(name), "updates": dict(new)}:
                 return [*new] == ["value"] and _accepts(controls.get(name), new["value"])
             case {"type": kind, **rest}:
                 return kind in _MESSAGES and all(_is_plain(*item) for item in rest.items())
-    except (TypeError, ValueError, RecursionError, msgspec.DecodeError):  # text, or no message
-        pass
     return False
 
 

@@ -65,16 +65,11 @@ def scene_html(scene: Scene) -> str:
         scene: The scene.
     """
     surfaces = replace_clouds(scene)
-    rows = [
-        (
-            name,
-            len(item.mesh.faces),
-            type(item.material).__name__,
-            " × ".join(f"{x:.3g}" for x in np.ptp(numbers(surfaces[name].vertices), axis=0)),
-            ", ".join(f"{x:.3g}" for x in item.center.detach().tolist()),
-        )
-        for name, item in scene.objects.items()
-    ]
+    rows = []
+    for name, item in scene.objects.items():
+        size = " × ".join(f"{x:.3g}" for x in np.ptp(numbers(surfaces[name].vertices), axis=0))
+        middle = ", ".join(f"{x:.3g}" for x in item.center.detach().tolist())
+        rows.append((name, len(item.mesh.faces), type(item.material).__name__, size, middle))
     heads = ("object", "triangles", "material", "size [m]", "middle [m]")
     return _figure_and_table(plotting.scene(surfaces), "three views of the scene", rows, heads)
 
@@ -156,15 +151,14 @@ def _figure_and_table(
 ) -> str:
     """A picture above a table; texts of users are escaped."""
     png = base64.b64encode(plotting.png_bytes(figure)).decode()
-    cells = [[html.escape(str(cell)) for cell in row] for row in (heads, *rows)]
-    top, *others = (
-        "".join(f"<{kind}>{cell}</{kind}>" for cell in row)
-        for kind, row in zip(("th", *("td",) * len(cells)), cells, strict=False)
-    )
-    body = "".join(f"<tr>{row}</tr>" for row in others)
+
+    def tag_cells(row: Sequence[Any], tag: str) -> str:
+        return "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in row)
+
+    body = "".join(f"<tr>{tag_cells(row, 'td')}</tr>" for row in rows)
     return (
         f'<img alt="{alt}" src="data:image/png;base64,{png}" style="max-width: 100%">'
-        f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+        f"<table><thead><tr>{tag_cells(heads, 'th')}</tr></thead><tbody>{body}</tbody></table>"
     )
 
 

@@ -162,9 +162,8 @@ class Viewer:
             gui.add_text("found", display.answer, multiline=True, disabled=True)
         last, several = len(self._steps) - 1, len(self._steps) > 1
         self._where = gui.add_text("state", "", disabled=True, visible=several)
-        self._step = gui.add_slider(
-            "step", 0, max(1, last), 1, max(0, self._wish.step), visible=several
-        )
+        begun = max(0, self._wish.step)
+        self._step = gui.add_slider("step", 0, max(1, last), 1, begun, visible=several)
         self._step.on_update(lambda _: self._update_state(step=int(self._step.value)))
         self._play = gui.add_checkbox("play", False, visible=several)
         self._play.on_update(lambda _: self._due.set())

@@ -4,8 +4,9 @@ The package rosbags reads them, which is plain Python; the extra ``ros`` install
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,11 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
+from invertwin.capture.refusals import refusal
 from invertwin.capture.track import Track
 from invertwin.checks import check_choice
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.storage.untrusted import existing_file, safe_reader
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["bags"]
 
 # Where messages with poses keep the place, by the names of their fields.
 _POSITION_FIELDS = ("pose.pose.position", "pose.position", "transform.translation")
@@ -51,7 +50,7 @@ class BagMessages:
         """
         shapes = {value.shape for value in self.values}
         if len(shapes) != 1:
-            raise InputError(_TEXTS["sizes"].format(len(shapes), sorted(shapes)[:2]))
+            raise refusal("bags.sizes", len(shapes), sorted(shapes)[:2])
         return torch.from_numpy(np.stack(self.values))
 
 
@@ -110,12 +109,10 @@ def read_track(path: str | Path, topic: str) -> Track:
 
     def read_position(message: Any) -> list[float]:
         for name in _POSITION_FIELDS:
-            held = message
-            for part in name.split("."):
-                held = getattr(held, part, None)
-            if held is not None:
-                return [held.x, held.y, held.z]
-        raise InputError(_TEXTS["poses"].format(topic, message.__msgtype__))
+            with suppress(AttributeError):
+                place = attrgetter(name)(message)
+                return [place.x, place.y, place.z]
+        raise refusal("bags.poses", topic, message.__msgtype__)
 
     found = dict(_read_messages(path, topic, read_position))
     times = sorted(found)
@@ -142,7 +139,7 @@ def read_clouds(path: str | Path, topic: str) -> list[dict[str, Float64[Tensor, 
 
     def parse_cloud(message: Any) -> dict[str, Tensor]:
         if not hasattr(message, "point_step"):
-            raise InputError(_TEXTS["clouds"].format(topic, message.__msgtype__))
+            raise refusal("bags.clouds", topic, message.__msgtype__)
         order = ">" if message.is_bigendian else "<"
         layout: Any = {
             "names": [one.name for one in message.fields],
@@ -166,7 +163,7 @@ def _open_bag(path: str | Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(_TEXTS["package"]) from None
+        raise refusal("bags.package") from None
     stored = [file for end in _ENDINGS for file in Path(path).glob(f"*.{end}")]
     for file in stored or [path]:
         existing_file(file, "a bag of ROS")
@@ -200,5 +197,5 @@ def _field_array(message: Any, field: str) -> NDArray[Any]:
         held = getattr(held, part)
     value = np.asarray(held)
     if value.dtype.kind not in "iufb":
-        raise InputError(_TEXTS["numbers"].format(field, type(held).__name__))
+        raise refusal("bags.numbers", field, type(held).__name__)
     return value

@@ -9,11 +9,9 @@ import torch
 from jaxtyping import Complex
 from torch import Tensor
 
-from invertwin.constants import read_table
-from invertwin.errors import InputError
+from invertwin.capture.refusals import refusal
 from invertwin.radar.signal.chirps import check_order
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["cubes"]
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]
 _Order = Sequence[int] | None  # of the turns of transmitters
 _Pulses = Complex[Tensor, "frame pulse rx sample"]  # cube of OpenRadar
@@ -84,4 +82,4 @@ def from_openradar(adc_data: _Pulses, transmitters: int, order: _Order = None) -
 
 def _check_divides(size: int, parts: int, what: str, of: str) -> None:
     if parts < 1 or size % parts:
-        raise InputError(_TEXTS["multiple"].format(parts, of, what, size))
+        raise refusal("cubes.multiple", parts, of, what, size)

@@ -15,17 +15,17 @@ import tomli_w
 import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
+from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.checks import check_choice, checked_tensor
-from invertwin.constants import FRAME, OLD_AXES, read_table
+from invertwin.constants import FRAME, OLD_AXES
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.runtime.memory import require_memory
 from invertwin.scene.antenna import AntennaArray
 from invertwin.storage import untrusted
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import replace_file, write_text_file
 from invertwin.storage.isolated_reader import read_isolated
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["described_arrays"]
 # The data tell these settings by their shape and kind.
 _KNOWN_FROM_DATA = {"samples", "loops", "frames", "real", "swap_iq", "lanes"}
 _KEYS = {
@@ -64,14 +64,11 @@ def load_described_board(
     if board is None:
         board, tx, rx = (described.get(key) for key in ("board", "tx_positions", "rx_positions"))
         if (board is None) == (tx is None or rx is None):
-            raise InputError(_TEXTS["board"].format(path, "neither" if board is None else "both"))
+            raise refusal("described_arrays.board", path, "neither" if board is None else "both")
         if board is None:
             return element_array(tx, "TX", axes), element_array(rx, "RX", axes)
-    return Mounting(
-        board,
-        described.get("elevation") if elevation is None else elevation,
-        described.get("azimuth", 1) if azimuth is None else azimuth,
-    )
+    elevation = described.get("elevation") if elevation is None else elevation
+    return Mounting(board, elevation, described.get("azimuth", 1) if azimuth is None else azimuth)
 
 
 @untrusted.safe_reader("samples as their description says")
@@ -112,13 +109,12 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     path = Path(path)
     description, _ = _load_chirp_description(path)
     data, given = description["data"], description["settings"]
-    array = load_array(
-        untrusted.named_file(path, str(data["file"])), data.get("variable"), trusted=trusted
-    )
+    file = untrusted.named_file(path, str(data["file"]))
+    array = load_array(file, data.get("variable"), trusted=trusted)
     order = data.get("dimensions", list(CHIRP_DIMS))
     real = array.dtype.kind != "c" and "iq" not in order
     if real and _are_powers(array):
-        raise InputError(_TEXTS["powers"].format(path.name))
+        raise refusal("described_arrays.powers", path.name)
     samples = arrange_dimensions(array, order, len(given.get("transmit_order", [])) or None)
     if data.get("conjugate", False):
         samples = samples.conj()
@@ -132,7 +128,7 @@ def read_chirps(path: str | Path, *, trusted: bool = False) -> ChirpData:
     try:
         settings = ChirpSettings(**values)
     except TypeError as error:
-        raise InputError(_TEXTS["settings"].format(path.name, error)) from error
+        raise refusal("described_arrays.settings", path.name, error) from error
     found = ChirpData(torch.from_numpy(samples), settings)
     if array.dtype.kind in "iu" or "bits" in given:
         found.warn_if_saturated()
@@ -165,7 +161,7 @@ def write_chirps(
     path = Path(path)
     target = path.parent / file
     if target.suffix not in _SUFFIXES or target.parent != path.parent:
-        raise InputError(_TEXTS["ending"].format(", ".join(_SUFFIXES), file))
+        raise refusal("described_arrays.ending", ", ".join(_SUFFIXES), file)
     s = data.settings
     samples = data.samples.detach().cpu().resolve_conj().numpy()
     array = np.ascontiguousarray(np.real(samples)) if s.real else samples
@@ -191,8 +187,7 @@ def write_chirps(
     if arrays is not None:
         tx, rx = (array.positions.tolist() for array in arrays)
         description["radar"] = {"tx_positions": tx, "rx_positions": rx}
-    with replace_file(path) as part:
-        part.write_text(tomli_w.dumps(description), encoding="utf-8")
+    write_text_file(path, tomli_w.dumps(description))
 
 
 def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
@@ -213,7 +208,7 @@ def element_array(positions: Any, name: str, axes: list[int]) -> AntennaArray:
 def _load_chirp_description(path: Path) -> tuple[dict[str, dict[str, Any]], list[int]]:
     description, axes = load_description(path, _KEYS)
     if "file" not in description.get("data", {}) or "settings" not in description:
-        raise InputError(_TEXTS["sections"].format(path.name))
+        raise refusal("described_arrays.sections", path.name)
     return description, axes
 
 
@@ -238,20 +233,19 @@ def load_description(
         description = tomllib.loads(text)
     frame = description.pop("frame", None)
     if frame not in (None, FRAME):
-        raise InputError(_TEXTS["frame"].format(FRAME, path.name, frame))
+        raise refusal("described_arrays.frame", FRAME, path.name, frame)
     for section, given in description.items():
         known = keys.get(section)
         if known is None or not isinstance(given, dict) or not set(given) <= known:
             others = sorted(set(given) - known) if known and isinstance(given, dict) else given
             wrong = f"[{section}]" if known is None else f"{others!r} in [{section}]"
-            raise InputError(
-                _TEXTS["keys"].format(", ".join(keys), path.name, wrong, sorted(known or keys))
-            )
+            names = sorted(known or keys)
+            raise refusal("described_arrays.keys", ", ".join(keys), path.name, wrong, names)
     if frame is not None:
         return description, [0, 1, 2]
     places = ", ".join(sorted(_PLACES.intersection(description.get("radar", {}))))
     if places:
-        text = _TEXTS["old_frame"].format(places, path.name, FRAME)
+        text = refusal_text("described_arrays.old_frame", places, path.name, FRAME)
         warnings.warn(text, PhysicsWarning, stacklevel=2)
     return description, list(OLD_AXES)
 
@@ -277,7 +271,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         try:
             array = _load_file(path, ending, variable, trusted=trusted)
         except KeyError:
-            raise InputError(_TEXTS["variable"].format(variable, path.name)) from None
+            raise refusal("described_arrays.variable", variable, path.name) from None
     if array.dtype.names is not None and len(array.dtype.names) == 2:
         # Complex numbers as MATLAB 7.3 stores them: pairs named real and imag; others r, i or I, Q.
         one, other = array.dtype.names
@@ -286,7 +280,7 @@ def load_array(path: Path, variable: str | None, *, trusted: bool) -> np.ndarray
         wide = pairs.dtype.itemsize > 4
         array = pairs.astype("f8" if wide else "f4").view("c16" if wide else "c8")[..., 0]
     if array.dtype.kind not in "iufc":
-        raise InputError(_TEXTS["numbers"].format(path.name, array.dtype))
+        raise refusal("described_arrays.numbers", path.name, array.dtype)
     if untrusted.numbers_expand(array.size, path):
         what = f"{array.size:.3g} numbers in a file of {path.stat().st_size} bytes"
         raise InputError(f"expected recorded samples in {path.name}, got {what}; copy it again")
@@ -318,18 +312,18 @@ def arrange_dimensions(array: np.ndarray, order: Any, transmitters: int | None) 
     valid = isinstance(order, list) and set(order) <= set(allowed) and len(set(order)) == len(order)
     both = valid and "virtual" in order and {"tx", "rx"} & set(order)
     if not valid or both or "sample" not in order or len(order) != array.ndim:
-        raise InputError(_TEXTS["dimensions"].format(array.ndim, allowed, order, array.shape))
+        raise refusal("described_arrays.dimensions", array.ndim, allowed, order, array.shape)
     if "iq" in order:
         parts = np.moveaxis(array, order.index("iq"), 0)
         if len(parts) != 2 or array.dtype.kind == "c":
-            raise InputError(_TEXTS["iq"].format(array.dtype, array.shape))
+            raise refusal("described_arrays.iq", array.dtype, array.shape)
         array = parts[0] + np.array(1j, np.result_type(array.dtype, np.complex64)) * parts[1]
         order = [name for name in order if name != "iq"]
     if "virtual" in order:
         axis = order.index("virtual")
         size = array.shape[axis]
         if transmitters is None or size % transmitters:
-            raise InputError(_TEXTS["virtual"].format(size, transmitters or "none"))
+            raise refusal("described_arrays.virtual", size, transmitters or "none")
         shape = (*array.shape[:axis], transmitters, size // transmitters, *array.shape[axis + 1 :])
         array = array.reshape(shape)
         order = [*order[:axis], "tx", "rx", *order[axis + 1 :]]

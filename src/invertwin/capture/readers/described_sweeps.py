@@ -14,8 +14,8 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.readers.touchstone import load_touchstone
+from invertwin.capture.refusals import refusal
 from invertwin.checks import checked_tensor
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
@@ -24,7 +24,6 @@ from invertwin.storage import untrusted
 
 TOUCHSTONE = re.compile(r"\.s\d+p", re.IGNORECASE)
 """Ending of a Touchstone file."""
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["described_sweeps"]
 _PARAMETER = re.compile(r"S([1-9])([1-9])")
 _KEYS = {
     "data": {"file", "files", "variable", "dimensions", "conjugate"},
@@ -111,12 +110,9 @@ def read_sweeps(path: str | Path, *, trusted: bool = False) -> Capture:
         description, axes = described_arrays.load_description(path, _KEYS)
     data, sweep, radar = (description.get(name, {}) for name in ("data", "sweep", "radar"))
     files = _find_data_files(path, data)
-    tx, rx = (
-        described_arrays.element_array(
-            radar.get(f"{end}_positions", [[0.0, 0.0, 0.0]]), end.upper(), axes
-        )
-        for end in ("tx", "rx")
-    )
+    origin = [[0.0, 0.0, 0.0]]
+    tx = described_arrays.element_array(radar.get("tx_positions", origin), "TX", axes)
+    rx = described_arrays.element_array(radar.get("rx_positions", origin), "RX", axes)
     source = _SweepFile(files[0], trusted)
     if TOUCHSTONE.fullmatch(files[0].suffix):
         frequencies, beat = _load_touchstone_sweeps(files, sweep, path)
@@ -138,10 +134,10 @@ def _select_band(frequencies: _Frequencies, beat: Tensor, band: Any) -> tuple[Te
     if band is None:
         return frequencies, beat
     if not isinstance(band, list) or len(band) != 2 or not float(band[0]) < float(band[1]):
-        raise InputError(_TEXTS["band"].format(band))
+        raise refusal("described_sweeps.band", band)
     inside = (frequencies >= band[0]) & (frequencies <= band[1])
     if inside.sum() < 2:
-        raise InputError(_TEXTS["empty_band"].format(frequencies.min(), frequencies.max(), band))
+        raise refusal("described_sweeps.empty_band", frequencies.min(), frequencies.max(), band)
     return frequencies[inside], beat[..., inside]
 
 
@@ -150,12 +146,12 @@ def _load_sweep_array(
 ) -> Tensor:
     """Load the sweeps of an array file, [frame, tx, rx, sample]."""
     if len(files) > 1:
-        raise InputError(_TEXTS["several_files"].format(len(files), files[0].name))
+        raise refusal("described_sweeps.several_files", len(files), files[0].name)
     array = described_arrays.load_array(files[0], data.get("variable"), trusted=trusted)
     order = data.get("dimensions", ["frame", "tx", "rx", "sample"])
     samples = torch.from_numpy(described_arrays.arrange_dimensions(array, order, tx_count))
     if samples.shape[1] != 1:
-        raise InputError(_TEXTS["several_chirps"].format(samples.shape[1]))
+        raise refusal("described_sweeps.several_chirps", samples.shape[1])
     return (samples[:, 0].conj() if data.get("conjugate", False) else samples[:, 0]).resolve_conj()
 
 
@@ -174,14 +170,14 @@ class _SweepFile:
         if beside.suffix == ".npy":
             return untrusted.read_npy(beside)
         if TOUCHSTONE.fullmatch(self.file.suffix) or self.file.suffix == ".npy":
-            raise InputError(_TEXTS["no_variables"].format(given, self.file.name))
+            raise refusal("described_sweeps.no_variables", given, self.file.name)
         return described_arrays.load_array(self.file, given, trusted=self.trusted)
 
 
 def _find_data_files(path: Path, data: dict[str, Any]) -> list[Path]:
     """The data files of a description, at least one."""
     if ("file" in data) == ("files" in data):
-        raise InputError(_TEXTS["files"].format("both" if data else "neither"))
+        raise refusal("described_sweeps.files", "both" if data else "neither")
     if "file" in data:
         return [untrusted.named_file(path, str(data["file"]))]
     named = data["files"]
@@ -218,7 +214,7 @@ def _load_parameter(file: Path, sweep: dict[str, Any]) -> tuple[Tensor, Tensor]:
     match = _PARAMETER.fullmatch(name)
     out, into = (int(port) for port in match.groups()) if match else (0, 0)
     if not (1 <= out <= ports and 1 <= into <= ports):
-        raise InputError(_TEXTS["parameter"].format(ports, file.name, name))
+        raise refusal("described_sweeps.parameter", ports, file.name, name)
     return found.frequencies, found.parameters[:, out - 1, into - 1]
 
 
@@ -226,8 +222,8 @@ def _load_response(file: Path, sweep: dict[str, Any], frequencies: Tensor) -> Te
     """The response of a file, if it was swept over the same frequencies."""
     own, response = _load_parameter(file, sweep)
     if len(own) != len(frequencies) or bool(((own - frequencies).abs() > 1e-9 * own).any()):
-        raise InputError(
-            _TEXTS["unlike_sweeps"].format(len(frequencies), file.name, len(own), own[0], own[-1])
+        raise refusal(
+            "described_sweeps.unlike_sweeps", len(frequencies), file.name, len(own), own[0], own[-1]
         )
     return response
 
@@ -238,7 +234,7 @@ def _load_frequencies(source: _SweepFile, sweep: dict[str, Any], samples: int) -
         given = np.ravel(source.values(sweep["frequencies"]))
         return checked_tensor(given, (samples,), "frequencies", "give one in Hz per sample")
     if not {"start_frequency", "step"} <= set(sweep):
-        raise InputError(_TEXTS["no_frequencies"])
+        raise refusal("described_sweeps.no_frequencies")
     count = torch.arange(samples, dtype=torch.float64)
     return float(sweep["start_frequency"]) + float(sweep["step"]) * count
 
@@ -247,20 +243,20 @@ def _frequency_spacing(frequencies: _Frequencies) -> tuple[float, float]:
     """First frequency and step of equally spaced ones [Hz]."""
     count = len(frequencies)
     if count < 2:
-        raise InputError(_TEXTS["few_frequencies"].format(count))
+        raise refusal("described_sweeps.few_frequencies", count)
     first = float(frequencies[0])
     step = (float(frequencies[-1]) - first) / (count - 1)
     line = first + step * torch.arange(count, dtype=torch.float64)
     if not (step > 0 and (frequencies - line).abs().max() <= _SPACING_TOLERANCE * step):
         steps = frequencies.diff()
-        raise InputError(_TEXTS["spacing"].format(float(steps.min()), float(steps.max())))
+        raise refusal("described_sweeps.spacing", float(steps.min()), float(steps.max()))
     return first, step
 
 
 def _load_positions(source: _SweepFile, given: Any, frames: int) -> Float64[Tensor, "frame 3"]:
     """The radar's position in every frame."""
     if given is None and frames > 1:
-        raise InputError(_TEXTS["no_positions"].format(frames))
+        raise refusal("described_sweeps.no_positions", frames)
     if given is None:
         return torch.zeros(1, 3, dtype=torch.float64)
     if isinstance(given, str) and given.lower().endswith(".csv"):
@@ -280,9 +276,8 @@ def _read_position_rows(file: Path) -> list[list[float]]:
         mark = next((m for m in ";\t" if m in head), ",")
         if mark == ";":  # where commas are decimal marks
             lines = [line.replace(",", ".") for line in lines]
-        names = [
-            re.sub(r"[\[(]m[\])]$", "", name.strip()).strip().lower() for name in head.split(mark)
-        ]
+        heads = (name.strip() for name in head.split(mark))
+        names = [re.sub(r"[\[(]m[\])]$", "", name).strip().lower() for name in heads]
         table = csv.DictReader(lines, names, delimiter=mark)
         return [[float(row[axis]) for axis in "xyz"] for row in table]
 

@@ -13,8 +13,9 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from invertwin.capture.refusals import refusal
 from invertwin.checks import check_choice, check_shape
-from invertwin.constants import OLD_AXES, read_table
+from invertwin.constants import OLD_AXES
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
@@ -24,7 +25,6 @@ from invertwin.storage.folders import replace_file
 from invertwin.storage.isolated_reader import read_isolated
 from invertwin.storage.untrusted import convert_read_errors, existing_file
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["radar_fields"]
 WAVEFORMS: dict[str, type[Waveform]] = {
     kind.__name__: kind for kind in (FMCW, Impulse, SteppedFrequency, OFDM)
 }
@@ -142,7 +142,7 @@ def read_tensor(dataset: xr.Dataset, name: str) -> Tensor:
 
 def _get_entry(entries: Mapping[Any, Any], name: str, what: str = "an attribute") -> Any:
     if name not in entries:
-        raise InputError(_TEXTS["entry"].format(what, name))
+        raise refusal("radar_fields.entry", what, name)
     return entries[name]
 
 
@@ -166,7 +166,7 @@ def _pattern_fields(end: str, pattern: Pattern) -> tuple[dict[str, xr.DataArray]
             phi: to_data_array((phi,), pattern.phi, "rad"),
             f"{end}_gain": to_data_array((theta, phi), pattern.gains, "1"),
         }, {name: "table"}
-    raise InputError(_TEXTS["pattern"].format(type(pattern).__name__))
+    raise refusal("radar_fields.pattern", type(pattern).__name__)
 
 
 def _array_from_fields(end: str, dataset: xr.Dataset) -> AntennaArray:
@@ -261,7 +261,7 @@ def _join_complex(dataset: xr.Dataset) -> xr.Dataset:
         real, whole = dataset[name], name.removesuffix("_real")
         imaginary = dataset.get(f"{whole}_imag")
         if imaginary is None or imaginary.dims != real.dims:
-            raise InputError(_TEXTS["imaginary_part"].format(whole, name))
+            raise refusal("radar_fields.imaginary_part", whole, name)
         # Part by part: real + 1j * imaginary would lose the signs of zeros.
         values = np.empty(real.shape, dtype=f"c{2 * real.dtype.itemsize}")
         values.real, values.imag = real.values, imaginary.values

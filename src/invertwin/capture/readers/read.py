@@ -7,11 +7,8 @@ from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.readers import described_arrays, described_sweeps
-from invertwin.constants import read_table
-from invertwin.errors import InputError
+from invertwin.capture.refusals import refusal
 from invertwin.radar.boards import Mounting, TxRxArrays
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["read"]
 
 
 def read(
@@ -53,9 +50,9 @@ def read(
         chirps = described_arrays.read_chirps(path, trusted=trusted)
         return chirps.to_chirp_capture(board or described_arrays.load_described_board(path))
     if ending not in (".bin", ".json"):
-        raise InputError(_TEXTS["ending"].format(path))
+        raise refusal("read.ending", path)
     if board is None:
-        raise InputError(_TEXTS["board"])
+        raise refusal("read.board")
     return ti.read_recording(path, settings, lanes).to_chirp_capture(board)
 
 

@@ -7,10 +7,9 @@ from string import Template
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
+from invertwin.capture.refusals import refusal
 from invertwin.constants import read_table
-from invertwin.errors import InputError
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["chirp_table"]
 FIELDS = read_table("invertwin.capture.ti", "fields.toml")
 """Names and places of numbers in both kinds of file."""
 # Numbers of a profile, and the power of ten of the units in which both kinds of file have them.
@@ -124,14 +123,14 @@ def frame_settings(
     defined: dict[int, tuple[int, int]] = {}
     for first, last, profile, senders, varies in chirps:
         if varies:
-            raise InputError(_TEXTS["variations"].format(first, last))
+            raise refusal("chirp_table.variations", first, last)
         _check_numbers(first, last)
         defined |= dict.fromkeys(range(first, last + 1), (profile, senders))
     first, last, loops, frames = (int(number) for number in frame[:4])
     _check_numbers(first, last)
     order, used = _transmit_order(defined, first, last)
     if len(used) != 1 or not used <= set(profiles):
-        raise InputError(_TEXTS["profiles"].format(sorted(used), sorted(profiles)))
+        raise refusal("chirp_table.profiles", sorted(used), sorted(profiles))
     profile = profiles[used.pop()]
     for (name, exponent), key in zip(_PROFILE.items(), keys, strict=True):
         values[name] = scale_decimal(profile[key], exponent)
@@ -148,7 +147,7 @@ def frame_settings(
 
 def _check_numbers(first: int, last: int) -> None:
     if not 0 <= first <= last < _MAX_CHIRPS:
-        raise InputError(_TEXTS["chirps"].format(_MAX_CHIRPS - 1, first, last))
+        raise refusal("chirp_table.chirps", _MAX_CHIRPS - 1, first, last)
 
 
 def _transmit_order(
@@ -158,11 +157,11 @@ def _transmit_order(
     order, used = [], set()
     for chirp in range(first, last + 1):
         if chirp not in defined:
-            raise InputError(_TEXTS["missing_chirp"].format(first, last, chirp))
+            raise refusal("chirp_table.missing_chirp", first, last, chirp)
         profile, enabled = defined[chirp]
         senders = bits_to_numbers(enabled)
         if len(senders) != 1:
-            raise InputError(_TEXTS["transmitters"].format(len(senders), chirp))
+            raise refusal("chirp_table.transmitters", len(senders), chirp)
         order.append(senders[0])
         used.add(profile)
     return order, used

@@ -15,18 +15,17 @@ import numpy as np
 import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
+from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.capture.ti import layouts
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.checks import check_choice
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
 from invertwin.runtime.memory import require_memory
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import existing_file, safe_reader
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["dca1000"]
 _WORD = np.dtype("<i2")
 
 
@@ -48,7 +47,7 @@ def read_recording(
     known = settings if isinstance(settings, ChirpSettings) else read_settings(settings or path)
     if lanes is not None:
         if known.lanes not in (None, lanes):
-            raise InputError(_TEXTS["lanes"].format(known.lanes, lanes))
+            raise refusal("dca1000.lanes", known.lanes, lanes)
         known = replace(known, lanes=lanes)
     return read_samples(recorded_files(path), known)
 
@@ -93,7 +92,7 @@ def read_samples(path: str | Path | Sequence[str | Path], settings: ChirpSetting
     size = sum(part.stat().st_size for part in paths)
     name = paths[0].name if paths else "nothing"
     if size % _WORD.itemsize:
-        raise InputError(_TEXTS["odd_bytes"].format(name, size))
+        raise refusal("dca1000.odd_bytes", name, size)
     require_memory(10.0 * size, f"the samples of {name}", "split the recording")
     words = np.frombuffer(b"".join(part.read_bytes() for part in paths), _WORD)
     if settings.bits < 16:
@@ -126,9 +125,9 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
     parts = np.stack([samples.real, samples.imag], axis=-1)
     top = 2 ** (settings.bits - 1) - 1
     if (parts != parts.round()).any() or parts.max() > top or parts.min() < -top - 1:
-        raise InputError(_TEXTS["counts"].format(-top - 1, top))
+        raise refusal("dca1000.counts", -top - 1, top)
     if settings.real and parts[..., 1].any():
-        raise InputError(_TEXTS["imaginary"])
+        raise refusal("dca1000.imaginary")
     words = np.zeros((len(parts), layouts.frame_words(settings)), _WORD)
     words[:, _word_indices(settings)] = parts[..., :1] if settings.real else parts
     with replace_file(path) as part:
@@ -137,7 +136,7 @@ def write_samples(path: str | Path, data: ChirpData) -> None:
 
 def _check_layout(settings: ChirpSettings) -> None:
     if settings.lanes is None:
-        raise InputError(_TEXTS["no_lanes"])
+        raise refusal("dca1000.no_lanes")
     why = layouts.layout_error(settings)
     if why is not None:
         raise InputError(f"expected {why}")
@@ -159,16 +158,16 @@ def _count_whole_frames(words: np.ndarray, settings: ChirpSettings, name: str) -
         wanted = f"{expected} frames of {frame}" if expected else f"whole frames of {frame}"
         advice = layouts.format_advice(others)
         where = " whose chirps break elsewhere" if exact else ""
-        raise InputError(_TEXTS["contradiction"].format(name, wanted, size, where, advice))
+        raise refusal("dca1000.contradiction", name, wanted, size, where, advice)
     if not exact and expected is not None and not cut:
-        raise InputError(_TEXTS["size"].format(expected * frame, name, expected, frame, size))
+        raise refusal("dca1000.size", expected * frame, name, expected, frame, size)
     if not frames:
-        raise InputError(_TEXTS["no_frame"].format(frame, name, size))
+        raise refusal("dca1000.no_frame", frame, name, size)
     missing = ""
     if rest:
-        missing = _TEXTS["incomplete_frame"].format(name, frames, rest, frame)
+        missing = refusal_text("dca1000.incomplete_frame", name, frames, rest, frame)
     elif expected is not None and frames < expected:
-        missing = _TEXTS["missing_frames"].format(name, frames, expected)
+        missing = refusal_text("dca1000.missing_frames", name, frames, expected)
     if missing:
         warnings.warn(missing, PhysicsWarning, stacklevel=4)
     return frames

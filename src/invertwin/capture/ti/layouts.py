@@ -17,12 +17,11 @@ from torch import Tensor
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
+from invertwin.capture.refusals import refusal_text
 from invertwin.capture.ti.device_limits import frame_duration
 from invertwin.checks import check_choice, checked_count
-from invertwin.constants import read_table
 from invertwin.errors import InputError
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["layouts"]
 LANE_COUNT = 4
 _MAX_WORDS = 2**17  # that are looked at
 _PREDICTION_ORDER = 6  # of the prediction of complex samples
@@ -53,15 +52,13 @@ def change_settings(settings: ChirpSettings, changes: Mapping[str, Any]) -> Chir
     Raises:
         InputError: Another name, or values that settings cannot have.
     """
+    values = dict(changes)
     for name in changes:
         do = "correct other numbers in the settings file"
         check_choice(name, CHANGEABLE_SETTINGS, "changes of", do)
-    values = {
-        _COUNTS.get(name, name): tuple(range(1, checked_count(value, name, 1) + 1))
-        if name in _COUNTS
-        else value
-        for name, value in changes.items()
-    }
+        if name in _COUNTS:
+            count = checked_count(values.pop(name), name, 1)
+            values[_COUNTS[name]] = tuple(range(1, count + 1))
     return replace(settings, **values)
 
 
@@ -129,10 +126,10 @@ def frame_words(settings: ChirpSettings) -> int:
 def layout_error(settings: ChirpSettings) -> str | None:
     """Return the reason why no DCA1000 records a file with these settings; None = it does."""
     if settings.lanes == LANE_COUNT and max(settings.receivers) > LANE_COUNT:
-        return _TEXTS["receivers"].format(LANE_COUNT, settings.receivers)
+        return refusal_text("layouts.receivers", LANE_COUNT, settings.receivers)
     count = settings.samples * len(settings.receivers)
     if settings.lanes == 2 and not settings.real and count % 2:
-        return _TEXTS["odd_samples"].format(count)
+        return refusal_text("layouts.odd_samples", count)
     return None
 
 
@@ -368,7 +365,7 @@ def format_advice(found: list[LayoutCandidate]) -> str:
     shown = " or ".join(map(str, near[:_MAX_LISTED]))
     said = "its samples do not tell where blocks end"
     if clear:
-        said = _TEXTS["border_ratio"].format(best.border_ratio)
+        said = refusal_text("layouts.border_ratio", best.border_ratio)
         if dearer < math.inf:
             said += f"; other blocks that do so cost {dearer / math.log(2):.2g} bits a word more"
     do = "correct the settings"

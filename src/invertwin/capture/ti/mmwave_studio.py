@@ -7,16 +7,15 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.refusals import refusal
 from invertwin.capture.ti import chirp_table
-from invertwin.constants import read_table
 from invertwin.errors import InputError
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import replace_file, write_text_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["mmwave_studio"]
-
-# Names of the numbers of a profile, and of the frame.
+# Names of the numbers of a profile, of chirps, and of the frame.
 _PROFILE = chirp_table.FIELDS["studio_profile"]
+_CHIRP = ("chirpStartIdx", "chirpEndIdx", "profileId")
 _FRAME = ("chirpStartIdx", "chirpEndIdx", "numLoops", "numFrames", "framePeriodicity_msec")
 _VARIATIONS = chirp_table.FIELDS["studio_variations"]
 
@@ -67,7 +66,7 @@ def setup_files(path: str | Path) -> list[Path]:
     except (KeyError, TypeError):
         names, base = [], ""
     if not names:
-        raise InputError(_TEXTS["files"].format(path.name))
+        raise refusal("mmwave_studio.files", path.name)
     return [_sibling_path(path, str(PureWindowsPath(base) / name)) for name in names]
 
 
@@ -76,7 +75,7 @@ def _load_json(path: Path) -> dict[str, Any]:
     with convert_read_errors(path, "JSON"):
         content = json.loads(whole, parse_float=Decimal)
     if not isinstance(content, dict):
-        raise InputError(_TEXTS["object"].format(path, type(content).__name__))
+        raise refusal("mmwave_studio.object", path, type(content).__name__)
     return content
 
 
@@ -103,21 +102,17 @@ def _parse_settings(content: dict[str, Any], device: str) -> ChirpSettings:
         _require_equal(int(layout["chInterleave"]), order, what, "other orders are not supported")
     profiles = _list_items(radio["rlProfiles"], "rlProfileCfg_t")
     profiles = [item["rlProfileCfg_t"] for item in profiles]
-    chirps = [item["rlChirpCfg_t"] for item in _list_items(radio["rlChirps"], "rlChirpCfg_t")]
+    chirps = []
+    for item in _list_items(radio["rlChirps"], "rlChirpCfg_t"):
+        chirp = item["rlChirpCfg_t"]
+        first, last, profile = (int(chirp[key]) for key in _CHIRP)
+        varies = any(float(chirp.get(name, 0)) for name in _VARIATIONS)
+        chirps.append((first, last, profile, _parse_integer(chirp["txEnable"]), varies))
     frame, output = radio["rlFrameCfg_t"], radio["rlAdcOutCfg_t"]["fmt"]
     return chirp_table.frame_settings(
         {int(profile["profileId"]): profile for profile in profiles},
         _PROFILE,
-        [
-            (
-                int(chirp["chirpStartIdx"]),
-                int(chirp["chirpEndIdx"]),
-                int(chirp["profileId"]),
-                _parse_integer(chirp["txEnable"]),
-                any(float(chirp.get(name, 0)) for name in _VARIATIONS),
-            )
-            for chirp in chirps
-        ],
+        chirps,
         [frame[key] for key in _FRAME],
         receivers=chirp_table.bits_to_numbers(_parse_integer(radio["rlChanCfg_t"]["rxChannelEn"])),
         real=int(output["b2AdcOutFmt"]) in (0, 3),
@@ -131,11 +126,11 @@ def _single_device(written: Any) -> dict[str, Any]:
     """The one device of the settings."""
     devices = _list_items(written, "rfConfig")
     if not devices:
-        raise InputError(_TEXTS["no_device"])
+        raise refusal("mmwave_studio.no_device")
     channels = [device["rfConfig"].get("rlChanCfg_t") or {} for device in devices]
     modes = [_parse_integer(own.get("cascading", 0)) for own in channels]
     if any(modes):
-        raise InputError(_TEXTS["cascade"].format(len(devices), ", ".join(map(str, modes))))
+        raise refusal("mmwave_studio.cascade", len(devices), ", ".join(map(str, modes)))
     do = "name a file with the device that recorded alone; give samples of several as arrays"
     _require_equal(len(devices), 1, "settings of one device", do)
     return devices[0]
@@ -178,8 +173,7 @@ def write_studio(path: str | Path, chirp_settings: ChirpSettings) -> None:
     if s.lanes is None:
         raise InputError("expected settings with 2 or 4 lanes, got none; set lanes")
     text = chirp_table.fill_file("studio", s, "#x", ",\n", lane_mask=hex(2**s.lanes - 1))
-    with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text_file(path, text)
 
 
 def write_setup(path: str | Path, settings: str | Path, recordings: Sequence[str | Path]) -> None:

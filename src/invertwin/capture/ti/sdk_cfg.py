@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from invertwin.capture.chirps import ChirpSettings
+from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.capture.ti import chirp_table, device_limits
-from invertwin.constants import read_table
 from invertwin.errors import InputError, PhysicsWarning
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import read_text, safe_reader
-
-_TEXTS: dict[str, str] = read_table("invertwin.capture", "refusals.toml")["sdk_cfg"]
 
 # What commands mean to samples: fewest arguments, required values, and what is ignored on purpose.
 _ARGUMENTS = chirp_table.FIELDS["arguments"]
@@ -61,7 +59,7 @@ def read_cfg(path: str | Path) -> ChirpSettings:
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     except (ValueError, ArithmeticError) as error:
-        raise InputError(_TEXTS["numbers"].format(path.name, error)) from error
+        raise refusal("sdk_cfg.numbers", path.name, error) from error
     messages = _compare_transmitters(found["profileCfg"], read.transmit_order)
     if unknown:
         messages.append(f"ignored {', '.join(unknown)}, not known here: they may change samples")
@@ -74,13 +72,12 @@ def _check_command(number: int, command: str, *arguments: str) -> None:
     """Refuse a line whose samples would mean something that is not supported."""
     line = f"line {number} ({' '.join((command, *arguments))[:60]})"
     if len(arguments) < (count := _ARGUMENTS.get(command, 0)):
-        raise InputError(_TEXTS["arguments"].format(count, command, len(arguments), line))
+        raise refusal("sdk_cfg.arguments", count, command, len(arguments), line)
     for rule in chirp_table.FIELDS["required"]:
         given = arguments[rule["place"] :][:1] if rule["command"] == command else ()
         if given and given[0] not in rule["values"]:
-            raise InputError(
-                f"expected {' or '.join(rule['values'])}, got {given[0]} in {line}; {rule['why']}"
-            )
+            allowed = " or ".join(rule["values"])
+            raise InputError(f"expected {allowed}, got {given[0]} in {line}; {rule['why']}")
 
 
 def _compare_transmitters(profiles: list[list[str]], order: tuple[int, ...]) -> list[str]:
@@ -90,7 +87,7 @@ def _compare_transmitters(profiles: list[list[str]], order: tuple[int, ...]) -> 
         code = int(float(profile[place]))
         each = {f"TX{tx}": code >> 8 * (tx - 1) + shift & 0xFF >> shift for tx in order}
         if len(set(each.values())) > 1:
-            found.append(_TEXTS["different_transmitters"].format(profile[0], what, each))
+            found.append(refusal_text("sdk_cfg.different_transmitters", profile[0], what, each))
     return found
 
 
@@ -106,7 +103,7 @@ def _read_calibration(found: dict[str, list[list[str]]]) -> dict[str, Any]:
 def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> ChirpSettings:
     for command in (*_UNIQUE_COMMANDS, "profileCfg", "chirpCfg"):
         if command not in found:
-            raise InputError(_TEXTS["command"].format(command))
+            raise refusal("sdk_cfg.command", command)
     channel, adc, frame = (found[command][-1] for command in _UNIQUE_COMMANDS)
     chirps = [
         (int(first), int(last), int(profile), int(tx, 0), any(map(float, variations)))
@@ -119,7 +116,7 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
     buffer = found.get("adcbufCfg", [[]])[-1]
     real, swap, blocks = (int(n) for n in buffer[-4:-1]) if buffer else (kind == 0, 0, lanes != 4)
     if bool(real) != (kind == 0) or (lanes and bool(blocks) != (lanes == 2)):
-        raise InputError(_TEXTS["buffer"].format(int(kind == 0), int(lanes != 4), real, blocks))
+        raise refusal("sdk_cfg.buffer", int(kind == 0), int(lanes != 4), real, blocks)
     read = chirp_table.frame_settings(
         {int(profile[0]): profile for profile in found["profileCfg"]},
         _PROFILE,
@@ -134,9 +131,9 @@ def _parse_settings(found: dict[str, list[list[str]]], lanes: int | None) -> Chi
     )
     unused = set(read.transmit_order) - set(chirp_table.bits_to_numbers(int(channel[1], 0)))
     if unused:
-        raise InputError(_TEXTS["transmitters"].format(unused))
+        raise refusal("sdk_cfg.transmitters", unused)
     if samples not in (None, read.samples):
-        raise InputError(_TEXTS["samples"].format(read.samples, samples))
+        raise refusal("sdk_cfg.samples", read.samples, samples)
     return read
 
 
@@ -163,5 +160,4 @@ def write_cfg(path: str | Path, chirp_settings: ChirpSettings, device: str = "")
     calibration = " ".join(map(chirp_table.format_decimal, numbers))
     text = chirp_table.fill_file("cfg", s, "d", "\n", calibration=calibration)
     named = f"% Platform:xWR{family}xx\n" if s.lanes else ""
-    with replace_file(path) as part:
-        part.write_text(named + text, encoding="utf-8")
+    write_text_file(path, named + text)

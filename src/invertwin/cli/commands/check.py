@@ -65,10 +65,8 @@ def run_check(run: RunFile) -> tuple[list[ReportTable], str]:
 def _make_tables(found: ResourceEstimate, scene: Scene, seconds: float, work: str) -> _Needs:
     rows = [[part.name, part.count, part.memory / 1e9, part.key] for part in found.memory_items]
     heads = ("needs", "how many", "GB", "key")
-    line = (
-        f"about {format_gigabytes(found.memory)} of {format_gigabytes(free_memory())} free, and "
-        f"{format_duration(seconds)} for {work}"
-    )
+    room = f"{format_gigabytes(found.memory)} of {format_gigabytes(free_memory())} free"
+    line = f"about {room}, and {format_duration(seconds)} for {work}"
     needs = ReportTable("Estimate", heads, rows, load_texts("notes")["estimate"])
     return [needs, _mesh_table(scene)], line
 
@@ -190,9 +188,8 @@ def _estimate_seconds(
     frames = whole.radar.frame_count
     sensor = replace(whole, radar=whole.radar.frames(range(min(_PROBE_FRAMES, frames))))
     still = Scene({name: replace(item, velocity=None) for name, item in truth.objects.items()})
-    each, ray = _fit_cost(
-        lambda count: _predict_map(sensor, still, depth, count, run.task not in _SIMULATION_TASKS)
-    )
+    fitted = run.task not in _SIMULATION_TASKS
+    each, ray = _fit_cost(lambda count: _predict_map(sensor, still, depth, count, fitted))
     used = min(getattr(settings, "frames_per_step", None) or frames, frames)
     seconds = found.map_count * each * used / sensor.radar.frame_count + found.ray_count * ray
     if found.path_count:

@@ -30,14 +30,10 @@ from invertwin.scene import Scene
 from invertwin.signatures import Signature
 from invertwin.storage.run_folder import RunFolder
 
-_TABLE_COLUMNS = (
-    *("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact", "ratio"),
-    *("L2 full", "correlation", "noise", "steps differ", "order", "pairs"),
-)
-_REPORT_FIELDS = (
-    *("full", "interior", "no_interior_edges", "no_contact"),
-    *("difference_noise", "step_agreement", "pairs"),
-)
+_TABLE_COLUMNS = ("scene", "L1 full", "L1 interior", "L1 no interior edges", "L1 no contact")
+_TABLE_COLUMNS += ("ratio", "L2 full", "correlation", "noise", "steps differ", "order", "pairs")
+_REPORT_FIELDS = ("full", "interior", "no_interior_edges", "no_contact")
+_REPORT_FIELDS += ("difference_noise", "step_agreement", "pairs")
 # Units of a derivative with respect to θ, by the value that θ changes; angles have their own.
 _DERIVATIVE_UNITS = {
     **dict.fromkeys(("translation", "offsets", "value", "place"), "1/m"),

@@ -37,15 +37,14 @@ def run_look(options: LookOptions, folder: RunFolder) -> tuple[list[ReportTable]
     """
     said: list[str] = []
     with _collect_warnings(said):
-        reader, recording = read_recording(options)
-    given = recording
-    if (
-        isinstance(given, captures.ChirpCapture)
-        and (recording := given.merge_single_ramps()) is not given
-    ):
-        said.append(f"reading: {recording.chirps.count} frames of one ramp are shown as one train")
-    as_recorded = recording
-    recording, metrics = _calibrate_channels(options, recording, folder)
+        reader, given = read_recording(options)
+    as_recorded = given
+    if isinstance(given, captures.ChirpCapture):
+        as_recorded = given.merge_single_ramps()
+        if as_recorded is not given:
+            count = as_recorded.chirps.count
+            said.append(f"reading: {count} frames of one ramp are shown as one train")
+    recording, metrics = _calibrate_channels(options, as_recorded, folder)
     capture, chirps = _to_capture(options, recording), None
     if isinstance(recording, captures.ChirpCapture) and recording.chirps.count > 1:
         chirps = recording
@@ -223,9 +222,8 @@ def _calibrate_channels(
     if options.channels is not None:
         calibration = captures.ChannelCalibration.load(options.channels)
     elif options.reflector is not None:
-        calibration = captures.estimate_channels(
-            _to_capture(options, recording), list(options.reflector)
-        )
+        signals = _to_capture(options, recording)
+        calibration = captures.estimate_channels(signals, list(options.reflector))
         calibration.save(folder.file("channels.json"))
     else:
         return recording, {}

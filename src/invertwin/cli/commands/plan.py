@@ -15,10 +15,11 @@ from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, load_texts, write_report
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
-from invertwin.cli.terminal import limit_rate, show_progress
+from invertwin.cli.terminal import show_progress
 from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.inversion.confidence.planning import fit_errors
 from invertwin.inversion.confidence.report import error_bar_metrics
+from invertwin.runtime.progress import track
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 
@@ -80,18 +81,16 @@ def _compare_with_fits(
     count = problem.run.plan.fits if problem.run.plan else 0
     if not count:
         return {}
-    rows, begin, done, say = [], time.perf_counter(), 0, limit_rate(console)
-    for number in range(count):
-        part = f"{PARTS}/fit_{number:03d}.json"
-        row = folder.read_json(part)
-        if row is None:
-            own = with_new_recording(problem, number + 1, console)
-            row = fit_errors(_prepare_fit_at_truth(own))
-            folder.write_json(part, row)
-            done += 1
-        left = (time.perf_counter() - begin) / max(done, 1) * (count - number - 1)
-        say(f"simulated fit {number + 1} of {count}, {left / 60:.0f} min left")
-        rows.append(row)
+    rows = []
+    with show_progress(console):
+        for number in track(range(count), "simulated fits"):
+            part = f"{PARTS}/fit_{number:03d}.json"
+            row = folder.read_json(part)
+            if row is None:
+                own = with_new_recording(problem, number + 1, console)
+                row = fit_errors(_prepare_fit_at_truth(own))
+                folder.write_json(part, row)
+            rows.append(row)
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
     ratios = {n: own / spread[n] for n, own in predicted_deviations.items() if spread.get(n)}

@@ -19,7 +19,7 @@ from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
 from invertwin.cli.terminal import RunBatch
 from invertwin.scene import Scene
-from invertwin.signatures import Signature, to_dbsm
+from invertwin.signatures import Signature, aspect_directions, to_dbsm
 from invertwin.storage.run_folder import RunFolder
 
 _MIN_LEVEL = -200.0  # dBsm that rounding leaves where there is no field
@@ -76,8 +76,7 @@ def _compute_rcs(name: str, run: RunFile, folder: RunFolder) -> _RcsMetrics:
     estimate_rcs_resources(run, scene).require_available()
     with prefix_errors("rcs"):
         found = table.build({Scene: scene})
-    levels = {name: found.dbsm[:, :, i, j] for name, (i, j) in table.channels.items()}
-    peaks = {name: float(own.max()) for name, own in levels.items()}
+    peaks = {n: float(found.dbsm[:, :, i, j].max()) for n, (i, j) in table.channels.items()}
     peaks = {name: level if level > _MIN_LEVEL else None for name, level in peaks.items()}
     kept: _RcsMetrics = {"peak_dbsm": peaks}
     if table.cases:
@@ -119,9 +118,7 @@ def _match_measurement(
     table: RcsTable, measurement: RcsMeasurement, found: Signature
 ) -> dict[str, _MeasuredRows]:
     data = load_rcs(measurement.file)
-    towards = torch.stack(
-        [data.theta.sin() * data.phi.cos(), data.theta.sin() * data.phi.sin(), data.theta.cos()], 1
-    )
+    towards = aspect_directions(data.theta, data.phi)
     off, aspect = torch.cdist(towards, found.directions).min(1)
     other, frequency = (data.frequency[:, None] / found.frequencies - 1).abs().min(1)
     same = (off < _MATCH_TOLERANCE) & (other < _MATCH_TOLERANCE)

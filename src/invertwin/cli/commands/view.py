@@ -22,7 +22,7 @@ from invertwin.cli.schema.motion_tables import build_moving_scene
 from invertwin.errors import InputError
 from invertwin.radar import Radar
 from invertwin.scene import Scene
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 
 _TIMES, _TIME_STEP = 48, 0.05  # steps in time of what moves, and their distance [s]
@@ -46,8 +46,7 @@ def run_view(
         viewer.AccessGuard(host, token)  # its errors come before any work
     display, links = load_display(target)
     if record is not None:
-        with replace_file(record) as part:
-            part.write_text(viewer.page_html(display, links), encoding="utf-8")
+        write_text_file(record, viewer.page_html(display, links))
         console.print(f"written: {record}", markup=False, soft_wrap=True)
         return
     with viewer.Viewer(display, links, host=host, port=port, token=token) as shown:
@@ -79,8 +78,7 @@ def _display_of_run(
     with prefix_file_errors(file):
         scene, truth = build.scene(run), build.true_scene(run)
         radars = _build_radars(run)
-        title = run.title or file.stem
-        names = run.fitted_objects
+        names = run.fitted_objects or list(run.truth)
         # Without a fit, show objects at their current pose.
         is_fit = folder is not None and (folder / VIEW_FILE).is_file()
         own = scene if is_fit else truth
@@ -90,10 +88,9 @@ def _display_of_run(
             for name, (radar, grid) in radars.items()
             if grid is not None
         }
-        display = viewer.build_display(own, radars, title, fitted=names or list(run.truth))
-        display = replace(
-            display, steps=[] if is_fit else _steps_in_time(run, own), shows_start=True
-        )
+        display = viewer.build_display(own, radars, run.title or file.stem, fitted=names)
+        steps = [] if is_fit else _steps_in_time(run, own)
+        display = replace(display, steps=steps, shows_start=True)
         antennas = [] if is_fit else _build_link_layers(run, own, folder)
     if folder is not None and is_fit:
         display = viewer.Display.load(folder / VIEW_FILE)

@@ -188,9 +188,8 @@ def tangent(run: RunFile, scene: Scene) -> tuple[nn.Module, dict[str, ParameterC
             coverage = own.coverage(scene, run.seed)
             panel = {PanelPlacement: own.place(coverage, own.initial, phases=True)}
         module = _build_module(table.parameter, "gradcheck.parameter", run.scene, scene, panel)
-    changes = {
-        n: c.build() if isinstance(c, ConstructorTable) else c for n, c in table.tangent.items()
-    }
+    rates = table.tangent.items()
+    changes = {n: c.build() if isinstance(c, ConstructorTable) else c for n, c in rates}
     with prefix_errors("gradcheck.tangent"):
         parameter_changes(module, changes)
     return module, changes

@@ -66,9 +66,7 @@ class VaryTable(ConstructorTable):
 def register(registry: Registry) -> None:
     """Add the distributions."""
     registry.groups["distribution"] = KindGroup(base=VaryTable)
-    registry.add("distribution", "uniform", Uniform)
-    registry.add("distribution", "log_uniform", LogUniform)
-    registry.add("distribution", "normal", Normal)
-    registry.add("distribution", "integer", Integer)
-    registry.add("distribution", "choice", Choice)
-    registry.add("distribution", "presence", Presence)
+    kinds: dict[str, type] = {"uniform": Uniform, "log_uniform": LogUniform, "normal": Normal}
+    kinds |= {"integer": Integer, "choice": Choice, "presence": Presence}
+    for name, kind in kinds.items():
+        registry.add("distribution", name, kind)

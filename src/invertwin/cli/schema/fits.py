@@ -43,14 +43,9 @@ class _InitialTable(ConstructorTable):
 AnyStarts = Annotated[Any, TableOf(sample_nearby_poses, _StartsTable, ("generator",))]
 AnyInitial = Annotated[Any, TableOf(InitialPoseEstimator, _InitialTable)]
 
-SamplingBase = registry.constructor_table(
-    Sampling,
-    "SamplingTable",
-    without=(
-        *("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend"),
-        "conductor_samples",  # as many as samples
-    ),
-)
+_NO_KEYS = ("interior_edges", "points_per_m2", "rough_paths", "memory_budget", "backend")
+_NO_KEYS += ("conductor_samples",)  # as many as samples
+SamplingBase = registry.constructor_table(Sampling, "SamplingTable", without=_NO_KEYS)
 
 
 class Budget(registry.constructor_table(Schedule, "Schedule", SamplingBase)):

@@ -16,7 +16,7 @@ from invertwin.limits import MAX_NUMBER
 from invertwin.registry.kinds import PLUGINS
 from invertwin.registry.section import suggest_name
 from invertwin.runtime.doctor import cache_folder
-from invertwin.storage.folders import replace_file
+from invertwin.storage.folders import write_text_file
 
 KEY_COLUMNS = ("key", "value", "default", "unit or meaning")
 _TYPE_NAMES = {"boolean": "true or false", "string": "text"}  # others are called as they are
@@ -42,8 +42,7 @@ def json_schema() -> JsonSchema:
         file.parent.mkdir(parents=True, exist_ok=True)
         for old in file.parent.glob("keys-*.json"):
             old.unlink()
-        with replace_file(file) as part:
-            part.write_text(json.dumps(schema), encoding="utf-8")
+        write_text_file(file, json.dumps(schema))
     return schema
 
 

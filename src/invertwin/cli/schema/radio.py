@@ -71,9 +71,8 @@ class TransmitterTable(AntennaTable):
         return Transmitters(places, self.build_mount(places), self.power_dbm, tail)
 
 
-PropagationBase: Any = registry.constructor_table(
-    PropagationSettings, "Reception", without=("receivers", "panels", "rough")
-)
+_GIVEN = ("receivers", "panels", "rough")
+PropagationBase: Any = registry.constructor_table(PropagationSettings, "Reception", without=_GIVEN)
 
 
 class RoughPathsTable(SamplingBase):

@@ -74,12 +74,8 @@ def register(registry: Registry) -> None:
     registry.add("data", "received", ReceivedData)
     registry.add("data", "received_file", ReceivedFile)
     registry.add("parameter", "reverberation", links.ReverberationParameters)
-    registry.add(
-        "parameter",
-        "transmitter",
-        links.TransmitterPosition,
-        without=("initial", "number", "scene"),
-    )
+    given = ("initial", "number", "scene")
+    registry.add("parameter", "transmitter", links.TransmitterPosition, without=given)
 
 
 def random_points(

@@ -152,10 +152,8 @@ def read_arrays(
     """
     with prefix_errors("file"):
         chirps = described_arrays.read_chirps(file, trusted=trusted)
-    if board is not None:
-        return assign_board(chirps, board)
     with prefix_errors("board"):
-        return chirps.to_chirp_capture(described_arrays.load_described_board(file))
+        return chirps.to_chirp_capture(board or described_arrays.load_described_board(file))
 
 
 def read_sweep_files(file: InputPath, trusted: bool = False) -> Capture:

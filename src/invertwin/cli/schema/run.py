@@ -38,10 +38,8 @@ from invertwin.signatures import rcs
 _RESERVED_NAMES = ("full", "whole", "seen", "count", "m", "number", "consistency")
 
 # Keys of a gradient check that say how paths are drawn.
-_SAMPLING_KEYS = (
-    *("depth", "samples", "boundary_samples", "repeats", "difference_samples", "noise"),
-    *("max_pairs", "scheme"),
-)
+_SAMPLING_KEYS = ("depth", "samples", "boundary_samples", "repeats", "difference_samples", "noise")
+_SAMPLING_KEYS += ("max_pairs", "scheme")
 
 _DUMP_GIVEN: dict[str, Any] = {"exclude_unset": True, "exclude_none": True}
 

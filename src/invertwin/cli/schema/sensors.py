@@ -204,9 +204,8 @@ class ChirpsTable(ConstructorTable):
     visibility_every: Count = 1
 
 
-AnyRadar = Annotated[
-    Any, TableOf(Radar, RadarTable, ("rotations", "range_bias", "range_origin"), checked=False)
-]
+_RADAR_GIVEN = ("rotations", "range_bias", "range_origin")
+AnyRadar = Annotated[Any, TableOf(Radar, RadarTable, _RADAR_GIVEN, checked=False)]
 AnyGrid = Annotated[Any, TableOf(Radar.grid, without=("self",))]
 AnyChirps = Annotated[Any, TableOf(Chirps, ChirpsTable, ("order",))]
 AnyImpairments = Annotated[Any, TableOf(Impairments, without=("snr_db", "noise_figure_db"))]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 from annotated_types import MinLen
@@ -23,6 +23,10 @@ from invertwin.scene.files import load_mesh
 from invertwin.scene.parameters import MaterialValues, Pose, Scale, Translation, Vertices
 from invertwin.scene.people.body import BodyTemplate
 from invertwin.scene.people.body_models import body, body_template
+
+# A table alone stands for a list of it.
+_ONE_OR_MORE = BeforeValidator(lambda given: [given] if isinstance(given, dict) else given)
+_MoverPart = Literal["place", "velocity", "spin", "size", "diffuse"]
 
 
 class ShapePoseTable(ConstructorTable):
@@ -46,9 +50,8 @@ class ShapePoseTable(ConstructorTable):
     def build_pose(self) -> Tensor:
         """Build the pose matrix [4, 4]."""
         turn = torch.tensor(self.rotation_deg, dtype=torch.float64).deg2rad()
-        return scenes.rigid(
-            scenes.rotation_from_vector(turn), torch.tensor(self.position, dtype=torch.float64)
-        )
+        place = torch.tensor(self.position, dtype=torch.float64)
+        return scenes.rigid(scenes.rotation_from_vector(turn), place)
 
     def build(self, given: Any = None, /, **more: Any) -> Any:
         """The mesh as a part of an object, placed within it."""
@@ -67,10 +70,7 @@ class _ObjectProperties(ConstructorTable):
 
     material: Annotated[Any, OneOf("material")]
     velocity: Vector | None = None
-    motion: Annotated[
-        list[Annotated[Any, OneOf("motion")]],
-        BeforeValidator(lambda given: [given] if isinstance(given, dict) else given),
-    ] = []
+    motion: Annotated[list[Annotated[Any, OneOf("motion")]], _ONE_OR_MORE] = []
 
 
 class ObjectTable(ShapePoseTable, _ObjectProperties):
@@ -150,13 +150,7 @@ class MovingTargetParameter(ParameterTable):
     kind: Literal["mover"]
     object: str
     cells: Count = 6
-    free: list[Literal["place", "velocity", "spin", "size", "diffuse"]] = [
-        "place",
-        "velocity",
-        "spin",
-        "size",
-        "diffuse",
-    ]
+    free: list[_MoverPart] = [*get_args(_MoverPart)]
 
 
 class PanelPhases(ParameterTable):
@@ -188,12 +182,10 @@ def register(registry: Registry) -> None:
     bodies = {ObjectTable, BodyTemplate, scenes.Walking, scenes.Sitting}
     registry.given |= bodies | {scenes.Scene, scenes.Mesh, scenes.Object}
     registry.groups["motion"] = KindGroup()
-    registry.add("motion", "walking", scenes.Walking, checked=False)
-    registry.add("motion", "sitting", scenes.Sitting, checked=False)
-    registry.add("motion", "waving", scenes.Waving, checked=False)
-    registry.add("motion", "breathing", scenes.Breathing, checked=False)
-    registry.add("motion", "turning", scenes.AxisRotation, checked=False)
-    registry.add("motion", "along", follow_spline, checked=False)
+    motions = {"walking": scenes.Walking, "sitting": scenes.Sitting, "waving": scenes.Waving}
+    motions |= {"breathing": scenes.Breathing, "turning": scenes.AxisRotation}
+    for name, motion in {**motions, "along": follow_spline}.items():
+        registry.add("motion", name, motion, checked=False)
     for name in ("plate", "box", "sphere", "cylinder", "dihedral", "trihedral", "text"):
         registry.add("shape", name, getattr(scenes.shapes, name))
     registry.add("shape", "prior", learned_car)

@@ -146,9 +146,8 @@ class RcsTable(ConstructorTable):
         named |= {f"measured[{i}]": m.channel for i, m in enumerate(self.measured)}
         for path, channel in named.items():
             if channel not in known:
-                text = refusal_text(
-                    "signature.channel", self.polarisation, ", ".join(known), channel
-                )
+                names = ", ".join(known)
+                text = refusal_text("signature.channel", self.polarisation, names, channel)
                 raise_key_error(text, f"{path}.channel")
         theta, phi = count_values(self.theta_deg), count_values(self.phi_deg)
         if theta != phi and 1 not in (theta, phi):
@@ -178,6 +177,5 @@ class RcsTable(ConstructorTable):
 
 
 def _unit_directions(table: RcsTable | ReceiverDirection) -> Tensor:
-    return aspect_directions(
-        expand_values(table.theta_deg).deg2rad(), expand_values(table.phi_deg).deg2rad()
-    )
+    angles = (table.theta_deg, table.phi_deg)
+    return aspect_directions(*(expand_values(angle).deg2rad() for angle in angles))
