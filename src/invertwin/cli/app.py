@@ -210,7 +210,8 @@ def demo(options: ResumableOptions) -> None:
     """Find a hidden letter from its radar echoes."""
     # In its own folder the demo replaces what it left there before.
     again = options.overwrite or (options.out is None and not options.resume)
-    _run_one_reconstruction(_find_demo_file(), replace(options, overwrite=again), Path("out/demo"))
+    given = command_options.FitOptions(**vars(options))
+    _run_one_reconstruction(_find_demo_file(), replace(given, overwrite=again), Path("out/demo"))
 
 
 @_command_with(command_options.LookOptions, _DATA)
@@ -332,19 +333,16 @@ def _run_recording(
     run_in_folder(options, Path("out", options.recording.name.split(".")[0] + ending), work)
 
 
-def _run_one_reconstruction(file: Path, options: ResumableOptions, default: Path) -> None:
+def _run_one_reconstruction(file: Path, options: command_options.FitOptions, default: Path) -> None:
     runs = load_runs([file], options, "reconstruct", _reconstruct_sections)
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         from invertwin.cli.commands.reconstruct import run_reconstruct
         from invertwin.cli.fits.spreading import FitWorkers
 
-        workers, view = None, False
-        if isinstance(options, command_options.FitOptions):
-            workers = FitWorkers.from_options(options.engine, options.workers)
-            view = options.view
+        workers = FitWorkers.from_options(options.engine, options.workers)
         with prefix_file_errors(file):
-            return run_reconstruct(runs[file.stem], folder, console, workers, view=view)
+            return run_reconstruct(runs[file.stem], folder, console, workers, view=options.view)
 
     run_in_folder(options, default, work, runs)
 

@@ -155,12 +155,11 @@ def make_sensor_maps(
         spectra: Power [frame, range, u, v] of every sensor, by what is shown.
         max_values: Values that are kept of a sensor, about; None = of a few megabytes.
     """
-    limit = {} if max_values is None else {"max_values": max_values}
     found = {}
     for k, (name, item) in enumerate(problem.sensor_data.items()):
         if item.grid is not None and all(spectra.values()):
             own = {what: maps[k] for what, maps in spectra.items()}
-            found[name] = viewer.DisplayMaps.from_spectra(own, item.grid, **limit)
+            found[name] = viewer.DisplayMaps.from_spectra(own, item.grid, max_values)
     return found
 
 

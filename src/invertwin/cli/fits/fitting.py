@@ -192,11 +192,9 @@ def run_fit(
         # The checkpoints say what the fit found; nothing is fitted again.
         return row, lambda: again()[0]
     begin = time.perf_counter()
-    name = f"start {index + 1}" + (
-        "" if method == problems.OWN_METHOD else f", {method.replace('_', ' ')}"
-    )
+    way = "" if method == problems.OWN_METHOD else f", {method.replace('_', ' ')}"
     steps = sum(stage.steps for stage in stages) * (4 if method == problems.AMONG_CLUTTER else 1)
-    with inversion.report_progress(name, steps, console) as shown:
+    with inversion.report_progress(f"start {index + 1}{way}", steps, console) as shown:
         found, found_ends = again(shown)
     curve = [[row["step"] + 1, row[CURVE_KEY]] for row in found.history if CURVE_KEY in row]
     row = {
@@ -247,11 +245,8 @@ def _fit_or_search(
         )
         return [*watching, *shown, _make_checkpoint(problem, folder, file), kept]
 
-    given = (
-        start.scene,
-        problems.make_observations(problem, start),
-        problems.make_unknowns(problem, start),
-    )
+    observations = problems.make_observations(problem, start)
+    given = start.scene, observations, problems.make_unknowns(problem, start)
     seed = derive_seed(run.seed, index)
     how: dict[str, Any] = {"loss": build.build_loss(run), "schedule": stages, "seed": seed}
     how["optimizer"] = build.build_section(run, "optimizer")
@@ -259,7 +254,7 @@ def _fit_or_search(
         # Kernels without blur reach far, too: all steps together move a tenth of a cell.
         rate = 0.1 * problem.first_sensor.sensor.waveform.range_resolution / stages[0].steps
         slow = replace(how["optimizer"], rate=rate, final_rate=None)
-        sharp = [replace(o, model=o.model.scale_blur(0.0)) for o in given[1]]
+        sharp = [replace(o, model=o.model.scale_blur(0.0)) for o in observations]
         unknowns = {name: replace(unknown, rate=None) for name, unknown in given[2].items()}
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
         how["callbacks"] = callbacks(checkpoint)

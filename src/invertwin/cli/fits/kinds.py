@@ -13,20 +13,18 @@ from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
 
+# By the section that tells it, the first that is there.
+_KINDS = {"placement": PanelCoverage, "aim": TransmitterCoverage, "map": ReceivedLevels}
 _MADE_FROM_DATA = ("transmitter", "panel", "panel_phases", "mover")  # parameters that need them
 
 
 def kind_of(run: RunFile) -> DataKind:
     """The kind of data that a run file fits."""
-    if run.placement is not None:
-        return PanelCoverage()
-    if run.aim is not None:
-        return TransmitterCoverage()
-    if run.map is not None:
-        return ReceivedLevels()
-    if isinstance(next(iter(run.parameters), None), MovingTargetParameter):
-        return MovingTarget()
-    return RadarMaps()
+    for section, kind in _KINDS.items():
+        if getattr(run, section) is not None:
+            return kind()
+    first = next(iter(run.parameters), None)
+    return MovingTarget() if isinstance(first, MovingTargetParameter) else RadarMaps()
 
 
 def build_problem(run: RunFile, console: Console) -> Problem:

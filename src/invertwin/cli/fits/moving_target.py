@@ -193,9 +193,8 @@ def _detect_echo(problem: Problem) -> Any:
     with prefix_errors("initial"):
         found = None if table is None else table.build()
     box = None if found is None or found.low is None else (found.low, found.high)
-    return discovery.detect_strongest_target(
-        problem.first_sensor.recording, _whole_map(problem), box
-    )
+    recording = problem.first_sensor.recording
+    return discovery.detect_strongest_target(recording, _whole_map(problem), box)
 
 
 def _times(recording: ChirpCapture) -> Tensor:
@@ -251,14 +250,11 @@ def _pictures(fits: Fits, folder: RunFolder) -> list[report.ReportPicture]:
     losses = {names.get(how, how.replace("_", " ")): own for how, own in fits.losses.items()}
     seen = doppler_maps(recording.beat, radar, whole.model.grid, recording.chirps)
     where = plotting.scene(scenes, radar, highlight=[whole.body.object])
+    directions = plotting.panels(over_directions)
     drawn = {
         "recording": (plotting.range_doppler(seen), "The recording", "doppler"),
         "twin_doppler": (plotting.panels(over_rates), "The mover over range and range rate", ""),
-        "twin_direction": (
-            plotting.panels(over_directions),
-            "The mover over range and azimuth",
-            "mover_direction",
-        ),
+        "twin_direction": (directions, "The mover over range and azimuth", "mover_direction"),
         "scene": (where, "Where it is", "mover_scene"),
         "loss": (plotting.convergence(losses), "1 − correlation of the magnitudes", ""),
     }

@@ -41,10 +41,8 @@ class PanelCoverage(DataKind):
     """An aim instead of data: the path loss that the worst share of receivers exceeds."""
 
     title: ClassVar[str] = "Placement of a metasurface"
-    unused: ClassVar[tuple[str, ...]] = (
-        *("radar", "grid", "chirps", "data", "calibration", "landscape", "measures", "model"),
-        *("starts", "map", "initial", "aim"),
-    )
+    unused = ("radar", "grid", "chirps", "data", "calibration", "landscape", "measures", "model")
+    unused += ("starts", "map", "initial", "aim")
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the receivers that score the panel."""

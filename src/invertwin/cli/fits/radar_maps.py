@@ -36,9 +36,8 @@ class RadarMaps(DataKind):
         radar_models.warn_if_depths_differ(run, sensors)
         require_resources(run, truth, sensors)
         data = radar_models.record_sensors(run, sensors, truth, console)
-        simulated = all(
-            isinstance(own.data, SimulatedData) for own in problems.sensor_runs(run).values()
-        )
+        runs = problems.sensor_runs(run).values()
+        simulated = all(isinstance(own.data, SimulatedData) for own in runs)
         known = frozenset(truth.names if simulated else run.truth)
         target = run.starts.object if run.starts else next(iter(run.fitted_objects), None)
         return Problem(run, scene, truth, known, data, target, kind=self)
@@ -89,12 +88,10 @@ class RadarMaps(DataKind):
     def predict_maps(self, problem: Problem, scene: Scene, sensors: Sequence[Any]) -> list[Tensor]:
         """Sharp spectra of a scene."""
         counts = {"samples": 4 * problem.run.fit_settings.samples, "boundary_samples": 0}
-        models = zip(radar_models.make_display_models(problem), sensors, strict=True)
+        models = [m.with_sampling(**counts) for m in radar_models.make_display_models(problem)]
+        pairs = zip(models, sensors, strict=True)
         with torch.no_grad():
-            return [
-                model.with_sampling(**counts).predict(scene, radar, problem.run.seed)
-                for model, radar in models
-            ]
+            return [model.predict(scene, radar, problem.run.seed) for model, radar in pairs]
 
     def metrics(self, fits: Fits) -> Row:
         """See ``DataKind.metrics``."""

@@ -42,9 +42,7 @@ class ReceivedLevels(DataKind):
 
     title: ClassVar[str] = "Received levels"
     histories: ClassVar[tuple[str, ...]] = ("curve", "checkpoint", "screened")
-    unused: ClassVar[tuple[str, ...]] = (
-        *("radar", "grid", "chirps", "calibration", "landscape", "model", "placement"),
-    )
+    unused = ("radar", "grid", "chirps", "calibration", "landscape", "model", "placement")
 
     def read_problem(self, run: RunFile, scene: Scene, truth: Scene, console: Console) -> Problem:
         """See ``DataKind.read_problem``; ``reference`` holds the true transmitters, where known."""

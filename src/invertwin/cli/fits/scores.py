@@ -118,10 +118,8 @@ def summarise_successes(
     counts = {mode: sum(row.get("success", False) for row in rows[mode]) for mode in modes}
     found = {"successes": counts[modes[0]], "starts_count": len(rows[modes[0]])}
     found |= {f"successes_{mode}": counts[mode] for mode in modes[1:]}
-    chosen = {
-        mode: (variant.reconstruct or {}).get("observations", [])
-        for mode, variant in problem.run.variants.items()
-    }
+    variants = problem.run.variants.items()
+    chosen = {mode: (own.reconstruct or {}).get("observations", []) for mode, own in variants}
     alone = {names[0]: counts[mode] for mode, names in chosen.items() if len(names) == 1}
     if alone:
         found |= {"joint_successes": counts[modes[0]], "alone_successes": alone}

@@ -89,9 +89,8 @@ class TransmitterCoverage(ReceivedLevels):
     def revise_confidence(self, fits: Fits, believed: Row) -> Row:
         """An aim has no noise: nothing to compare the map with, and no error bars."""
         (module,) = fits.found.parameters
-        bounds = [
-            f"{name} is at the end of its range" for name in getattr(module, "at_bounds", list)()
-        ]
+        names = getattr(module, "at_bounds", list)()
+        bounds = [f"{name} is at the end of its range" for name in names]
         none = "An aim has no noise: there are no error bars."
         word = "at a bound" if bounds else "unknown"
         return {"verdict": word, "verdict_reasons": bounds, "no_error_bars": none}

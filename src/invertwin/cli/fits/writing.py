@@ -207,9 +207,9 @@ def draw_pictures(fits: Fits, metrics: Row, folder: RunFolder) -> list[ReportPic
     titles = {"measured": f"data ({data})", "start": "surrogate, start", "twin": "surrogate, twin"}
     for number, (name, item) in enumerate(problem.sensor_data.items()):
         titled = {titles[key]: maps[number] for key, maps in fits.maps.items()}
-        file = f"spectra_{name}" if name else "spectra"
+        tail = f"_{name}" if name else ""
         figure = plotting.spectrum(titled, item.grid)
-        found.append(report.save_picture(folder, file, figure, note="spectra"))
+        found.append(report.save_picture(folder, f"spectra{tail}", figure, note="spectra"))
         if item.grid.u_count > 1 or item.sensor.frame_count > 1:
             del titled[titles["start"]]
             marked = {"twin": ends["twin"]} | ({"truth": outline} if outline else {})
