@@ -81,16 +81,14 @@ def _compare_with_fits(
     count = problem.run.plan.fits if problem.run.plan else 0
     if not count:
         return {}
-    rows = []
+    parts = [f"{PARTS}/fit_{number:03d}.json" for number in range(count)]
+    found = {part: row for part in parts if (row := folder.read_json(part)) is not None}
     with show_progress(console):
-        for number in track(range(count), "simulated fits"):
-            part = f"{PARTS}/fit_{number:03d}.json"
-            row = folder.read_json(part)
-            if row is None:
-                own = with_new_recording(problem, number + 1, console)
-                row = fit_errors(_prepare_fit_at_truth(own))
-                folder.write_json(part, row)
-            rows.append(row)
+        for part in track([part for part in parts if part not in found], "simulated fits"):
+            own = with_new_recording(problem, parts.index(part) + 1, console)
+            found[part] = fit_errors(_prepare_fit_at_truth(own))
+            folder.write_json(part, found[part])
+    rows = [found[part] for part in parts]
     errors = torch.tensor([list(row.values()) for row in rows], dtype=torch.float64)
     spread = dict(zip(rows[0], errors.std(0).tolist(), strict=True))
     ratios = {n: own / spread[n] for n, own in predicted_deviations.items() if spread.get(n)}
