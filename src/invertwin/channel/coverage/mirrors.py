@@ -65,8 +65,9 @@ def deposit_mirrored_power(
         link: antennas, per frame.
         grid: bins of one frame.
         mirrors: names of the smooth flat objects that reflect.
-        sampling: numbers of points and of edge points; ``depth`` is the maximum number of surfaces
-            on a path, the one that scatters included.
+        sampling: numbers of samples, of which a point counts as 64 and a point on an edge as 8,
+            since their paths are dearer; ``depth`` is the maximum number of surfaces on a path, the
+            one that scatters included.
         seed: random seed of the points.
 
     Raises:
