@@ -34,7 +34,7 @@ class PhysicsWarning(UserWarning):
 
 
 @contextmanager
-def prefix_errors(where: str) -> Iterator[None]:
+def locate_errors(where: str) -> Iterator[None]:
     """Put the place of a fault before the text of an InputError.
 
     Args:

@@ -14,7 +14,6 @@ from invertwin.links.responses import AntennaMount
 from invertwin.links.reverberation import NEPERS_PER_DB, Reverberation
 from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
-from invertwin.scene.shape_models.lattice import Lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +147,11 @@ class TransmitterPosition(nn.Module):
             raise InputError("expected both corners of the box, got one; give low and high")
         self._box = None
         if low is not None and high is not None:
-            box = Lattice.from_bounds(low, high, (2, 2, 2))
-            self._box = torch.stack([box.low, box.high])
+            named = (("low", low), ("high", high))
+            ends = [
+                checked_tensor(at, (3,), f"{name} corner of the box [m]", do) for name, at in named
+            ]
+            self._box = torch.stack(ends)
             if not bool(((begun > self._box[0]) & (begun < self._box[1])).all()):
                 raise InputError(
                     "expected an initial place inside the box, got one outside or on its border; "

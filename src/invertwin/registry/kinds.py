@@ -481,7 +481,8 @@ def number_or_list(*kinds: Any) -> Any:
         kind = "list" if isinstance(value, list) else kind
         return section.TAG_MARK + (kind if kind in tags else tags[0])
 
-    members = [Annotated[kind, Tag(section.TAG_MARK + tag(kind))] for kind in kinds]
+    named = zip(kinds, tags, strict=True)
+    members = [Annotated[kind, Tag(section.TAG_MARK + name)] for kind, name in named]
     return Annotated[_union_type(members), Discriminator(form)]
 
 

@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from invertwin.checks import check_choice, checked_tensor
-from invertwin.errors import InputError, PhysicsWarning, prefix_errors
+from invertwin.errors import InputError, PhysicsWarning, locate_errors
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import shapes
 from invertwin.scene.material.materials import PerfectConductor, RoughConductor, RoughDielectric
@@ -124,7 +124,7 @@ def _load_with(
                 vertices = _GLTF.inverse.vectors(torch.from_numpy(vertices)).numpy()
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
-    with prefix_errors(str(path)):
+    with locate_errors(str(path)):
         # Check the raw file first: merging would hide its defects.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
@@ -212,7 +212,7 @@ def load_scene_xml(
     with untrusted.convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
         require_at_most(len(root), _MAX_SHAPES, "shapes", "join those of one material")
-    with prefix_errors(str(file)):
+    with locate_errors(str(file)):
         return _build_scene(root, file, dict(materials or {}), default)
 
 
@@ -409,7 +409,7 @@ def _build_scene(
         named = [part for part in map(element.find, ("ref", "bsdf")) if part is not None]
         material = named[0].get("id", "") if named else ""
         referred.add(material)
-        with prefix_errors(f"shape {name!r}"):
+        with locate_errors(f"shape {name!r}"):
             mesh = _shape(element, file)
         objects[name] = Object(mesh, known.get(material, default))
     unused = sorted(set(materials) - referred)
@@ -426,7 +426,7 @@ def _read_materials(root: ElementTree.Element) -> dict[str, Material]:
     found: dict[str, Material] = {}
     for element in root.iter("bsdf"):
         name = element.get("id", "")
-        with prefix_errors(f"material {name!r}"):
+        with locate_errors(f"material {name!r}"):
             material = read_radio_material(element)
         if material is not None:
             found[name] = material

@@ -236,6 +236,8 @@ def to_json_value(value: Any) -> Any:
     """A value as JSON can hold it: tensors and arrays as lists, non-finite numbers as None."""
 
     def convert(other: Any) -> Any:
+        if isinstance(other, Mapping):
+            return dict(other)
         return other.tolist() if hasattr(other, "tolist") else str(other)
 
     return to_jsonable_python(value, inf_nan_mode="null", fallback=convert)

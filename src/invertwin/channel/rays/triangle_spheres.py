@@ -9,7 +9,6 @@ from invertwin.channel.em.plane_waves import dot
 from invertwin.channel.rays.topology import morton_order
 
 _GROUP_SIZE = 8  # triangles
-_MAX_PAIRS = 1 << 22  # lines × groups, or × triangles, at a time
 
 
 class TriangleSpheres:
@@ -36,29 +35,22 @@ class TriangleSpheres:
     ) -> tuple[Int64[Tensor, " pair"], Int64[Tensor, " pair"]]:
         """Find the triangles whose spheres meet the infinite lines through two points each.
 
+        Give few enough lines at a time: in the worst case each comes close to all triangles.
+
         Args:
             start, end: the points [m].
 
         Returns:
             Rows of the lines, in ascending order, and triangles, ascending for each line.
         """
-        rows, faces = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, dtype=torch.int64)]
         unit = normalize(end - start, dim=1)
-        for some in torch.arange(len(start)).split(max(1, _MAX_PAIRS // len(self.members))):
-            along = unit[some] @ self.group_center.T - dot(unit[some], start[some])[:, None]
-            square = torch.cdist(start[some], self.group_center).square() - along.square()
-            row, group = torch.nonzero(square <= self.group_radius.square(), as_tuple=True)
-            pairs = some[row], group
-            for line, number in zip(
-                *(p.split(_MAX_PAIRS // _GROUP_SIZE) for p in pairs), strict=True
-            ):
-                face, beam = self.members[number], unit[line, None]
-                offset = self.center[face] - start[line, None]
-                square = offset.square().sum(2) - dot(offset, beam).square()
-                near = (square <= self.radius[face].square()) & ~self.is_copy[number]
-                index, place = torch.nonzero(near, as_tuple=True)
-                rows.append(line[index])
-                faces.append(face[index, place])
-        row, face = torch.cat(rows), torch.cat(faces)
+        along = unit @ self.group_center.T - dot(unit, start)[:, None]
+        square = torch.cdist(start, self.group_center).square() - along.square()
+        row, group = torch.nonzero(square <= self.group_radius.square(), as_tuple=True)
+        face = self.members[group]
+        offset = self.center[face] - start[row, None]
+        square = offset.square().sum(2) - dot(offset, unit[row, None]).square()
+        near = (square <= self.radius[face].square()) & ~self.is_copy[group]
+        row, face = row[:, None].expand_as(face)[near], face[near]
         order = (row * len(self.center) + face).argsort()
         return row[order], face[order]
