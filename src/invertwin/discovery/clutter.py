@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float64
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from invertwin import inversion
@@ -26,6 +27,7 @@ from invertwin.scene import MaterialValues, Mesh, Object, Scene, signed_distance
 # as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
 _SIGNIFICANT = 3.0  # standard deviations of a permittivity from the stated one
+_LOG_SUSCEPTIBILITIES = -3.0, 4.0  # search for initial permittivities: 1.05 to 56
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
 
@@ -99,8 +101,9 @@ def reconstruct_among_clutter(
         return found
 
     again, found = copy.deepcopy(unknowns), fit_rounds(unknowns, 0)
-    if needs_clutter(found) and (free := _free_permittivities(objects)):
-        bright = fit_rounds(again | free, 2)
+    if needs_clutter(found):
+        free = _free_permittivities(scene, given, again, seed=seed, **options)
+        bright = fit_rounds(again | free, 2) if free else found
         if any(_has_moved(bright, key, objects) for key in free):
             found = choose_result(found, bright)
     found = replace(found, doubts=tuple(_find_rivals(found.scene, given, fitted, seed)))
@@ -129,7 +132,8 @@ def reconstruct_with_permittivities(
     """Fit objects together with their permittivities, which determine how bright they are.
 
     An object that is brighter in the model than in the data otherwise rotates its faces away from
-    the radar.
+    the radar, which it does at once: permittivities therefore start where the blurred maps of the
+    initial scene are most likely.
 
     Args:
         scene: initial scene.
@@ -142,18 +146,34 @@ def reconstruct_with_permittivities(
             fitted object has a known permittivity.
     """
     unknowns = name_unknowns(parameters)
-    fit = inversion.prepare_fit(scene, observations, unknowns)
-    free = _free_permittivities(fit.apply_modules()[0].objects)
+    free = _free_permittivities(scene, observations, unknowns, **options)
     if not free:
         problem = "expected a fitted object of known permittivity beside one that is not fitted"
         raise InputError(f"{problem}, got none; use reconstruct")
     return inversion.reconstruct(scene, observations, unknowns | free, **options)
 
 
-def _free_permittivities(objects: Mapping[str, Object]) -> dict[str, Unknown]:
-    """Permittivities that determine how bright moved objects are, as unknowns."""
-    known = find_known_permittivities(objects)
+def _free_permittivities(
+    scene: Scene, observations: Sequence[inversion.Observation], unknowns: Unknowns, **options: Any
+) -> dict[str, Unknown]:
+    """Return permittivities that determine how bright moved objects are, as unknowns.
+
+    They start where the blurred maps of the initial scene are most likely, one after the other.
+    """
+    how = {key: options[key] for key in ("loss", "regularizers", "seed") if key in options}
+    fit = inversion.prepare_fit(scene, observations, unknowns, **how)
+    known = find_known_permittivities(fit.apply_modules()[0].objects)
     values = {f"{n}.permittivity": MaterialValues(n, permittivity=e) for n, e in known.items()}
+    fit = fit.copy(*values.values())
+    for module in values.values():
+        (raw,) = module.parameters()
+
+        def loss(value: float, raw: Tensor = raw) -> float:
+            with torch.no_grad():
+                raw.fill_(value)
+                return float(fit.evaluate(0))
+
+        loss(minimize_scalar(loss, bounds=_LOG_SUSCEPTIBILITIES, options={"xatol": 0.1}).x)
     return {name: Unknown(module) for name, module in values.items()}
 
 
