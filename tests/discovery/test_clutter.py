@@ -17,6 +17,7 @@ from invertwin.inversion import Optimizer, SpectrumLoss
 from invertwin.models import ExactMap, SurrogateMap
 from invertwin.scene import (
     AntennaArray,
+    Dielectric,
     MaterialValues,
     Pose,
     RoughDielectric,
@@ -120,6 +121,44 @@ def test_what_has_no_clutter_is_named(recording):
     exact = iw.Observation(ExactMap(observation.model.grid), observation.data)
     with pytest.raises(InputError, match="expected a SurrogateMap for clutter"):
         estimate_clutter(truth, exact, ["letter"])
+
+
+@pytest.fixture(scope="module")
+def lobed(recording):
+    """A letter with a lobe of 25°, and a start that takes it for matt."""
+    truth, _, observation = recording
+    shiny = RoughDielectric(4.0, diffuse=0.3, lobe_width=math.radians(25))
+    sensor, grid = observation.initial_sensor(), observation.model.grid
+    points = iw.Sampling(depth=1, points_per_m2=4e3)
+    scene = truth.replace("letter", material=shiny)
+    data = iw.simulate(scene, sensor, grid, seed=7, sampling=points, snr_db=20.0)
+    start = iw.Scene({"letter": letter((0.06, -0.05), 0.3), "wall": truth["wall"]})
+    capture = iw.Capture.from_beat(data.beat, sensor)
+    return truth, start, iw.Observation(observation.model, capture)
+
+
+@pytest.mark.slow
+def test_a_lobe_that_the_model_lacks_is_found(lobed):
+    truth, start, observation = lobed
+    pose = Pose("letter", axes="xy", rotation_axes="z")
+    found = reconstruct_among_clutter(start, observation, pose, seed=1, always=False, **FIT)
+    assert found.verdict.word == "consistent"
+    material, bars = vars(found.scene["letter"].material), found.uncertainty.deviations
+    for name, value in (("diffuse", 0.3), ("lobe_width", math.radians(25))):
+        assert abs(float(material[name]) - value) < 3 * bars[f"letter.{name}"] < 0.6
+    off = (found.scene["letter"].center - truth["letter"].center).abs()
+    assert float(off.norm()) < 0.02
+    assert float(off[0]) < 3 * bars["letter.x"]
+    assert float(off[1]) < 3 * bars["letter.y"]
+
+
+def test_lobes_are_those_of_rough_dielectrics(lobed):
+    _, start, observation = lobed
+    wooden = start.replace("letter", material=Dielectric(4.0, scattering=1.0))
+    with pytest.raises(InputError, match="RoughDielectric with known lobes, got none; leave out"):
+        reconstruct_with_permittivities(
+            wooden, [observation], Pose("letter", axes="xy"), lobes=True, seed=1, **FIT
+        )
 
 
 def test_permittivities_start_where_the_first_maps_are_most_likely(recording):

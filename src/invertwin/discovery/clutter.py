@@ -21,13 +21,22 @@ from invertwin.inversion.confidence.uncertainty import find_known_permittivities
 from invertwin.inversion.observation import Unknown, Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models import SurrogateMap, WhitenedMap
-from invertwin.scene import MaterialValues, Mesh, Object, Scene, signed_distance
+from invertwin.scene import (
+    MaterialValues,
+    Mesh,
+    Object,
+    RoughDielectric,
+    Scene,
+    signed_distance,
+)
 
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
 # as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
 _SIGNIFICANT = 3.0  # standard deviations of a permittivity from the stated one
 _LOG_SUSCEPTIBILITIES = -3.0, 4.0  # search for initial permittivities: 1.05 to 56
+_DIFFUSE_SHARES = 0.1, 0.6  # of initial lobes: from a surface without a lobe, it has no effect
+_LOBE_WIDTHS = 0.1, 1.0  # of initial lobes [rad]
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
 
@@ -57,8 +66,9 @@ def reconstruct_among_clutter(
         schedule: schedule of each fit, or its stages; all frames in every step.
         seed: seed of all random numbers.
         callbacks: observers of each fit, given its number: 0 and 1, 2 and 3 with permittivities.
-        always: False = only if the data contradict a fit without clutter and, of that fit with free
-            permittivities, if they contradict the first; the better fit is returned.
+        always: False = only if the data contradict a fit without clutter and the same fits with
+            free permittivities and with free lobes, if they contradict the first; the better fit is
+            returned.
         options: further options of ``reconstruct``.
 
     Raises:
@@ -102,8 +112,8 @@ def reconstruct_among_clutter(
 
     again, found = copy.deepcopy(unknowns), fit_rounds(unknowns, 0)
     if needs_clutter(found):
-        free = _free_permittivities(scene, given, again, seed=seed, **options)
-        bright = fit_rounds(again | free, 2) if free else found
+        free = _free_materials(scene, given, again, seed=seed, **options)
+        bright = fit_rounds(again | name_unknowns(free), 2) if free else found
         if any(_has_moved(bright, key, objects) for key in free):
             found = choose_result(found, bright)
     found = replace(found, doubts=tuple(_find_rivals(found.scene, given, fitted, seed)))
@@ -113,13 +123,15 @@ def reconstruct_among_clutter(
 def _fit_without_clutter(
     scene: Scene, given: list[inversion.Observation], unknowns: dict[str, Unknown], **how: Any
 ) -> inversion.Reconstruction:
-    """Fit copies of the parameters, with permittivities if the data are consistent with that."""
+    """Fit copies of the parameters, with material values if the data are consistent with that."""
     plain = inversion.reconstruct(scene, given, copy.deepcopy(unknowns), **how)
     if needs_permittivities(plain):
-        with suppress(InputError):  # the data do not determine permittivities
-            bright = reconstruct_with_permittivities(scene, given, copy.deepcopy(unknowns), **how)
-            if not needs_clutter(bright):
-                return bright
+        with suppress(InputError):  # the data do not determine material values
+            for lobes in (False, True):
+                own = copy.deepcopy(unknowns)
+                found = reconstruct_with_permittivities(scene, given, own, lobes=lobes, **how)
+                if not needs_clutter(found):
+                    return found
     return plain
 
 
@@ -127,6 +139,8 @@ def reconstruct_with_permittivities(
     scene: Scene,
     observations: Sequence[inversion.Observation],
     parameters: Unknowns,
+    *,
+    lobes: bool = False,
     **options: Any,
 ) -> inversion.Reconstruction:
     """Fit objects together with their permittivities, which determine how bright they are.
@@ -139,34 +153,45 @@ def reconstruct_with_permittivities(
         scene: initial scene.
         observations: recordings.
         parameters: modules Scene → Scene, as for ``reconstruct``.
+        lobes: fit diffuse shares and lobe widths of objects of a ``RoughDielectric``, too.
         options: further options of ``reconstruct``.
 
     Raises:
         InputError: as ``reconstruct``; all objects are fitted, which leaves the gain unknown, or no
-            fitted object has a known permittivity.
+            fitted object has a known permittivity, or with ``lobes`` no known lobe.
     """
     unknowns = name_unknowns(parameters)
-    free = _free_permittivities(scene, observations, unknowns, **options)
+    free = _free_materials(scene, observations, unknowns, lobes=lobes, **options)
     if not free:
         problem = "expected a fitted object of known permittivity beside one that is not fitted"
         raise InputError(f"{problem}, got none; use reconstruct")
-    return inversion.reconstruct(scene, observations, unknowns | free, **options)
+    if lobes and not any("diffuse" in values.raw for values in free.values()):
+        problem = "expected a fitted object of a RoughDielectric with known lobes, got none"
+        raise InputError(f"{problem}; leave out lobes")
+    return inversion.reconstruct(scene, observations, unknowns | name_unknowns(free), **options)
 
 
-def _free_permittivities(
-    scene: Scene, observations: Sequence[inversion.Observation], unknowns: Unknowns, **options: Any
-) -> dict[str, Unknown]:
+def _free_materials(
+    scene: Scene,
+    observations: Sequence[inversion.Observation],
+    unknowns: Unknowns,
+    *,
+    lobes: bool = False,
+    **options: Any,
+) -> dict[str, MaterialValues]:
     """Return permittivities that determine how bright moved objects are, as unknowns.
 
     They start where the blurred maps of the initial scene are most likely, one after the other.
     """
     how = {key: options[key] for key in ("loss", "regularizers", "seed") if key in options}
     fit = inversion.prepare_fit(scene, observations, unknowns, **how)
-    known = find_known_permittivities(fit.apply_modules()[0].objects)
-    values = {f"{n}.permittivity": MaterialValues(n, permittivity=e) for n, e in known.items()}
+    objects, values = fit.apply_modules()[0].objects, dict[str, MaterialValues]()
+    for name, value in find_known_permittivities(objects).items():
+        lobe = _find_initial_lobe(objects[name]) if lobes else {}
+        values[f"{name}.permittivity"] = MaterialValues(name, permittivity=value, **lobe)
     fit = fit.copy(*values.values())
     for module in values.values():
-        (raw,) = module.parameters()
+        raw = module.raw["permittivity"]
 
         def loss(value: float, raw: Tensor = raw) -> float:
             with torch.no_grad():
@@ -174,7 +199,21 @@ def _free_permittivities(
                 return float(fit.evaluate(0))
 
         loss(minimize_scalar(loss, bounds=_LOG_SUSCEPTIBILITIES, options={"xatol": 0.1}).x)
-    return {name: Unknown(module) for name, module in values.items()}
+    return values
+
+
+def _find_initial_lobe(item: Object) -> dict[str, Any]:
+    """Return diffuse share and lobe width of an object, away from the ends of their ranges."""
+    material = item.material
+    if not isinstance(material, RoughDielectric):
+        return {}
+    share, width = material.diffuse, material.lobe_width
+    if not isinstance(share, float) or not isinstance(width, float):
+        return {}
+    return {
+        "diffuse": min(max(share, _DIFFUSE_SHARES[0]), _DIFFUSE_SHARES[1]),
+        "lobe_width": min(max(width, _LOBE_WIDTHS[0]), _LOBE_WIDTHS[1]),
+    }
 
 
 def _has_moved(found: inversion.Reconstruction, key: str, before: Mapping[str, Object]) -> bool:

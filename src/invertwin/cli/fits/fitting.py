@@ -121,7 +121,7 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     if wanted == "never" or not problem.kind.allows_clutter(problem):
         return fits
     if wanted == "auto":
-        fits = _fit_permittivities(fits, folder, console)
+        fits = _fit_materials(fits, folder, console)
         if not discovery.needs_clutter(fits.found):
             return fits
     try:
@@ -144,18 +144,23 @@ def _fit_among_clutter(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     return replace(fits, best=row, found=among) if kept else fits
 
 
-def _fit_permittivities(fits: Fits, folder: RunFolder, console: Console) -> Fits:
-    """Make the best fit again with free permittivities if the data contradict it or these."""
+def _fit_materials(fits: Fits, folder: RunFolder, console: Console) -> Fits:
+    """Make the best fit again with free permittivities if the data contradict it or these.
+
+    If the data contradict that fit as well, make it with free lobes, too.
+    """
     if not discovery.needs_permittivities(fits.found):
         return fits
-    given = fits.problem, fits.start, fits.best["start"], problems.WITH_PERMITTIVITIES
-    try:
-        row, outcome = run_fit(*given, folder, console)
-    except InputError:  # the data do not determine permittivities
-        return fits
-    rows, bright = {**fits.rows, problems.WITH_PERMITTIVITIES: [row]}, outcome()
-    kept = {} if discovery.needs_clutter(bright) else {"best": row, "found": bright}
-    return replace(fits, rows=rows, **kept)
+    given = fits.problem, fits.start, fits.best["start"]
+    for method in (problems.WITH_PERMITTIVITIES, problems.WITH_LOBES):
+        try:
+            row, outcome = run_fit(*given, method, folder, console)
+        except InputError:  # the data do not determine material values
+            break
+        fits, found = replace(fits, rows={**fits.rows, method: [row]}), outcome()
+        if not discovery.needs_clutter(found):
+            return replace(fits, best=row, found=found)
+    return fits
 
 
 def run_fit(
@@ -259,8 +264,8 @@ def _fit_or_search(
         how["schedule"] = replace(stages[0], models=(), optimizer=slow)
         how["callbacks"] = callbacks(checkpoint)
         return inversion.reconstruct(start.scene, sharp, unknowns, **how), {}
-    if method == problems.WITH_PERMITTIVITIES:
-        how["callbacks"] = callbacks(checkpoint)
+    if method in (problems.WITH_PERMITTIVITIES, problems.WITH_LOBES):
+        how |= {"callbacks": callbacks(checkpoint), "lobes": method == problems.WITH_LOBES}
         return discovery.reconstruct_with_permittivities(*given, **how), {}
     if method == problems.AMONG_CLUTTER:
         # Every frame has clutter of its own.

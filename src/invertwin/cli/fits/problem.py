@@ -27,7 +27,7 @@ from invertwin.storage.run_folder import RunFolder
 
 OWN_METHOD, INTERIOR_ONLY = "full", "interior_only"
 AMONG_CLUTTER, FROM_IMAGE = "among_clutter", "from_image"
-WITH_PERMITTIVITIES = "with_permittivities"
+WITH_PERMITTIVITIES, WITH_LOBES = "with_permittivities", "with_permittivities_and_lobes"
 OF_SENSORS = ("radar_pose", "radar_path", "transmitter", "reverberation", "panel", "panel_phases")
 """Kinds of parameters that belong to a sensor."""
 HISTORIES = ("losses", "curve", "checkpoint", "screened")
