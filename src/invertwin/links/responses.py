@@ -18,6 +18,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.runtime.memory import require_memory
 from invertwin.scene import AntennaArray
+from invertwin.scene.material.fresnel import safe_root
 
 _VALUES_PER_CHUNK = 1 << 21
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``, and in the frame of an array
@@ -69,8 +70,7 @@ class AntennaMount:
     def _turned_weights(self, direction: Tensor, turn: Tensor) -> Tensor:
         local = torch.einsum("pij,pi->pj", turn, direction)
         gain = self.array.pattern.gain(local)
-        lit = gain > 0  # a root of zero has no derivative
-        strength = torch.where(lit, torch.where(lit, gain, 1.0).sqrt(), 0.0)
+        strength = safe_root(gain, 0.0)
         up = torch.tensor(_UP, dtype=torch.float64, device=direction.device)
         own, basis = polarisations(local, up), polarisations(direction, up)
         change = torch.einsum("pwi,pij,pbj->pwb", basis, turn, own).to(torch.complex128)

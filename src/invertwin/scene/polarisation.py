@@ -17,6 +17,7 @@ from torch import Tensor
 
 from invertwin import checks
 from invertwin.errors import InputError
+from invertwin.scene.material.fresnel import safe_root
 
 JONES: Mapping[str, tuple[complex, complex]] = MappingProxyType(
     {"V": (1.0, 0.0), "H": (0.0, 1.0), "circular": (0.5**0.5, 0.5**0.5 * 1j)}
@@ -132,7 +133,7 @@ class JonesTable:
         theta, nodes, vectors = (t.to(x.device) for t in (self.theta, self.phi, self.vectors))
         # Neither the radius nor atan2 has a gradient on the axis; φ is arbitrary there.
         on_axis = (y == 0) & (z == 0)
-        radius = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, y**2 + z**2).sqrt())
+        radius = safe_root(y**2 + z**2, 0.0)
         row, up = _locate_nodes(theta, torch.atan2(radius, x))
         phi = torch.atan2(z, torch.where(on_axis, 1.0, y))
         around = torch.cat([nodes, nodes[:1] + 2 * math.pi])

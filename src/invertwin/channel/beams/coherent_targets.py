@@ -19,6 +19,7 @@ from invertwin.channel.paths import Link, Paths, concatenate_paths, make_paths
 from invertwin.channel.sampling import Sampling
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.scene.material.fresnel import safe_root
 from invertwin.scene.material.materials import RoughDielectric
 from invertwin.scene.scene import Scene
 
@@ -74,9 +75,7 @@ def trace_target(
     fraction = _visible_shares(other_scene, points, link.tx, boundary=boundary)
     if not link.shared_visibility:
         both = fraction * _visible_shares(other_scene, points, link.rx, boundary=boundary)
-        # The square root has no derivative at zero.
-        positive = both > 0
-        fraction = torch.where(positive, torch.where(positive, both, 1.0).sqrt(), 0.0)
+        fraction = safe_root(both, 0.0)
     return paths.scale_fields(fraction[paths.frame])
 
 

@@ -22,6 +22,7 @@ from invertwin.channel.rays.ray_scene import RayScene, find_passed_sheets
 from invertwin.channel.rays.scene_tables import Geometry, interpolate_values
 from invertwin.channel.rows import Rows
 from invertwin.constants import SPEED_OF_LIGHT
+from invertwin.scene.material.fresnel import safe_root
 
 _Numbers: TypeAlias = Int64[Tensor, " n"]
 
@@ -191,8 +192,7 @@ def evaluate_scattering(
         outer, (incident, outgoing), (first, second), strict=True
     ):
         passing = _interpolate_table(surfaces.refraction, row, cosine)
-        open_ = ~total & (passing > 0)
-        root = root * torch.where(open_, torch.where(open_, passing, 1.0).sqrt(), 0.0)
+        root = root * safe_root(torch.where(total, 0.0, passing), 0.0)
         index = torch.where(tilt < 0, surfaces.index[row], 1.0)
         mismatch = mismatch + index[:, None] * (direction - normal * tilt[:, None])
     lobe = torch.exp(-mismatch.square().sum(1) / (2 * variance)) / (2 * torch.pi * variance)

@@ -38,7 +38,7 @@ from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.runtime.concurrency import torch_threads
 from invertwin.scene import Scene
-from invertwin.scene.material.fresnel import FieldCoefficients
+from invertwin.scene.material.fresnel import FieldCoefficients, safe_root
 
 _Pairs = single_scattering.ScatteredPairs
 _Maps = Float32[Tensor, "frame range u v"]
@@ -275,9 +275,7 @@ class _MirrorSearch:
 
     def rough_fields(self, pairs: _Pairs, _: _Places, points: _Points) -> Paths:
         """Paths with fields of rough points: the root of their power, with the points' phases."""
-        positive = pairs.weight > 0  # a root of zero has no derivative
-        root = torch.where(positive, torch.where(positive, pairs.weight, 1.0).sqrt(), 0.0)
-        phasor = torch.polar(root, points.phase)[:, None, None]
+        phasor = torch.polar(safe_root(pairs.weight, 0.0), points.phase)[:, None, None]
         scattering = phasor * random_scattering_matrix([pairs.depolarisation], points.phase)
         out, back = pairs.outbound, pairs.inbound
         sent, received = _amplitudes(self.link, out, back)

@@ -15,6 +15,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from invertwin.channel.paths import Link
+from invertwin.scene.material.fresnel import safe_root
 
 _LINEAR, _CIRCULAR = 2.0, 4.0
 
@@ -111,8 +112,7 @@ def random_scattering_matrix(
     for number, (share, which) in enumerate(
         zip((probabilities[0], rotated, rotated, probabilities[1]), order, strict=True)
     ):
-        positive = share.detach() > 1e-15
-        root = torch.where(positive, torch.where(positive, share, 1.0).sqrt(), 0.0)
+        root = safe_root(share, 1e-15)
         # Late decimal digits of a phase are as random as the phase.
         angle = 2 * torch.pi * ((cycles * 1e6 * (number + _GOLDEN)) % 1) if number else 0 * cycles
         total = total + torch.polar(root, angle)[:, None, None] * _MATRICES[which]

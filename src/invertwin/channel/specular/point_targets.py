@@ -19,6 +19,7 @@ from invertwin.channel.specular.trace_paths import trace_paths
 from invertwin.checks import ArrayLike, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
+from invertwin.scene.material.fresnel import safe_root
 from invertwin.scene.scene import Scene
 
 
@@ -127,8 +128,7 @@ def antenna_amplitudes(
     jones = link.tx_jones if transmits else link.rx_jones
     rotation = link.rotations[legs.tx]
     gain = pattern.gain(torch.einsum("nij,ni->nj", rotation, legs.departure))
-    positive = gain > 0  # the square root has no derivative at zero
-    strength = torch.where(positive, torch.where(positive, gain, 1.0).sqrt(), 0.0)
+    strength = safe_root(gain, 0.0)
     fields = antenna_fields(jones, rotation, legs.departure)
     axes = polarisations(legs.departure).to(fields.dtype)
     return strength[:, None, None] * torch.einsum("nkx,nix->nki", fields, axes)

@@ -24,6 +24,7 @@ from invertwin.limits import MAX_LENGTH
 from invertwin.runtime.memory import require_at_most
 from invertwin.scene import Scene
 from invertwin.scene.antenna import centre_positions
+from invertwin.scene.material.fresnel import safe_root
 
 _VALUES_PER_CHUNK = 1 << 22  # of antennas and elements
 _UP = (0.0, 0.0, 1.0)  # of V in ``RayPaths``
@@ -189,10 +190,8 @@ def _element_waves(
         aside = whole[:, None, 1:] - (0 if far_field else cells.offsets)
         ahead = whole[:, None, :1].expand(-1, len(cells.offsets), 1)
         toward = torch.cat([ahead, aside.expand(*ahead.shape[:2], 2)], 2) / length[..., None]
-        gain = panel.pattern.gain(toward)
-        some = gain > 0  # a root of zero has no derivative
         # Of a cell of λ/2, π is the gain that takes all of what falls on it.
-        obliquity = torch.where(some, torch.where(some, gain, 1.0) / math.pi, 0.0).sqrt()
+        obliquity = safe_root(panel.pattern.gain(toward) / math.pi, 0.0)
     return torch.polar(visible / length, -wave_number * later), obliquity
 
 
