@@ -24,7 +24,6 @@ from invertwin.capture.readers.radar_fields import (
     to_data_array,
     write_dataset,
 )
-from invertwin.capture.refusals import refusal
 from invertwin.capture.track import Track
 from invertwin.channel import Grid
 from invertwin.constants import SPEED_OF_LIGHT
@@ -33,6 +32,7 @@ from invertwin.radar.processing.backprojection import UPSAMPLING, interpolate_sa
 from invertwin.radar.processing.beamforming import exact_spectrum
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SampledWaveform
+from invertwin.refusals import refusal
 from invertwin.storage.untrusted import convert_read_errors
 
 _Profiles = Complex[Tensor, "frame range"]

@@ -12,13 +12,13 @@ from torch import Tensor
 from invertwin.capture.capture import BEAT_DIMS, Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.readers.radar_fields import to_data_array
-from invertwin.capture.refusals import refusal
 from invertwin.checks import check_shape, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
 from invertwin.limits import MAX_NUMBER
 from invertwin.radar.radar import require_sampled_waveform
 from invertwin.radar.waveform import unit_window
+from invertwin.refusals import refusal
 from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import convert_read_errors, read_text
 

@@ -8,10 +8,10 @@ from jaxtyping import Complex, Float64
 from torch import Tensor
 
 from invertwin.capture.capture import BeatUnit, Capture
-from invertwin.capture.refusals import refusal
 from invertwin.checks import check_shape
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps
+from invertwin.refusals import refusal
 
 
 @dataclass(frozen=True, eq=False)

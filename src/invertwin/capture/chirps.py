@@ -15,7 +15,6 @@ from torch import Tensor
 
 from invertwin import limits
 from invertwin.capture.chirp_capture import ChirpCapture
-from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.checks import check_fields, check_shape, check_some, checked_number, checked_tensor
 from invertwin.constants import SPEED_OF_LIGHT
 from invertwin.errors import InputError
@@ -23,6 +22,7 @@ from invertwin.radar.boards import Mounting, TxRxArrays
 from invertwin.radar.radar import Radar
 from invertwin.radar.signal.chirps import Chirps, check_order
 from invertwin.radar.waveform import FMCW, PhysicsWarning
+from invertwin.refusals import refusal, refusal_text
 from invertwin.runtime.memory import require_memory
 
 CHIRP_DIMS = ("frame", "chirp", "tx", "rx", "sample")

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from invertwin.capture.refusals import refusal
 from invertwin.checks import checked_ascending, checked_tensor
+from invertwin.refusals import refusal
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,11 @@ from invertwin import __version__
 from invertwin.cli import inputs
 from invertwin.cli import options as command_options
 from invertwin.cli.options import FileArgument, ResumableOptions, argument, console, option
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, use_plain_style
 from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
 from invertwin.errors import InputError, exit_on_interrupt, to_one_line
+from invertwin.refusals import refusal
 from invertwin.runtime.threads import available_threads
 from invertwin.storage.folders import convert_os_errors
 from invertwin.storage.run_folder import RunFolder

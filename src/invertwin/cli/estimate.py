@@ -10,13 +10,13 @@ import torch
 from invertwin.capture import Capture
 from invertwin.channel import Grid
 from invertwin.channel.sampling import resolve_densities
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.schema.signature import count_values
 from invertwin.inversion import require_edge_length
 from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.signal.range_profile import fft_bins
+from invertwin.refusals import refusal
 from invertwin.runtime.memory import format_gigabytes, free_memory, require_at_most
 from invertwin.scene import Mesh, Object, Scene
 from invertwin.scene.scene import warn_if_purely_specular

@@ -6,12 +6,12 @@ from typing import Any
 import torch
 
 from invertwin.channel import Grid, Sampling
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, sensors
 from invertwin.cli.schema.motion_tables import build_moving_scene, refuse_motion
 from invertwin.errors import PhysicsWarning
 from invertwin.radar import Chirps, Radar
+from invertwin.refusals import refusal, refusal_text
 from invertwin.scene import MovingScene, Scene
 from invertwin.simulation import Simulation, simulate, simulate_chirps
 

@@ -4,9 +4,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from invertwin.cli.options import RecordingOptions
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.constants import read_table
 from invertwin.errors import InputError
+from invertwin.refusals import refusal, refusal_text
 from invertwin.registry.kinds import load_plugins
 from invertwin.storage.untrusted import existing_file
 

@@ -17,10 +17,10 @@ import tomli_w
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.report import load_texts
 from invertwin.constants import FRAME, read_table
 from invertwin.errors import InputError
+from invertwin.refusals import refusal, refusal_text
 from invertwin.registry.section import TAG_MARK, suggest_name
 from invertwin.registry.section import prefix_errors as prefix_errors
 from invertwin.registry.section import require_section as require_section

@@ -16,9 +16,9 @@ from rich.text import Text
 
 from invertwin.cli.inputs import require_files
 from invertwin.cli.options import OutputOptions, ResumableOptions, RunOptions, console
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell, use_plain_style
 from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
+from invertwin.refusals import refusal
 from invertwin.runtime.progress import format_duration, progress_callback
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder, open_run

@@ -16,10 +16,10 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from invertwin.capture.refusals import refusal
 from invertwin.capture.track import Track
 from invertwin.checks import check_choice
 from invertwin.errors import InputError
+from invertwin.refusals import refusal
 from invertwin.storage.untrusted import existing_file, safe_reader
 
 # Where messages with poses keep the place, by the names of their fields.

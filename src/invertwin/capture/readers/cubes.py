@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Complex
 from torch import Tensor
 
-from invertwin.capture.refusals import refusal
 from invertwin.radar.signal.chirps import check_order
+from invertwin.refusals import refusal
 
 _Beat = Complex[Tensor, "frame chirp tx rx sample"]
 _Order = Sequence[int] | None  # of the turns of transmitters

@@ -15,11 +15,11 @@ import tomli_w
 import torch
 
 from invertwin.capture.chirps import CHIRP_DIMS, ChirpData, ChirpSettings
-from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.checks import check_choice, checked_tensor
 from invertwin.constants import FRAME, OLD_AXES
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.radar.boards import Mounting, TxRxArrays
+from invertwin.refusals import refusal, refusal_text
 from invertwin.runtime.memory import require_memory
 from invertwin.scene.antenna import AntennaArray
 from invertwin.storage import untrusted

@@ -14,11 +14,11 @@ from torch import Tensor
 from invertwin.capture.capture import Capture
 from invertwin.capture.readers import described_arrays
 from invertwin.capture.readers.touchstone import load_touchstone
-from invertwin.capture.refusals import refusal
 from invertwin.checks import checked_tensor
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import SteppedFrequency
+from invertwin.refusals import refusal
 from invertwin.scene import look_at
 from invertwin.storage import untrusted
 

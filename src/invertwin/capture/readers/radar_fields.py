@@ -13,12 +13,12 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from invertwin.capture.refusals import refusal
 from invertwin.checks import check_choice, check_shape
 from invertwin.constants import OLD_AXES
 from invertwin.errors import InputError
 from invertwin.radar.radar import Radar
 from invertwin.radar.waveform import FMCW, OFDM, Impulse, SteppedFrequency, Waveform
+from invertwin.refusals import refusal
 from invertwin.scene.antenna import AntennaArray, Cosine, Isotropic, Pattern, TabulatedPattern
 from invertwin.scene.polarisation import JonesTable, Polarisation
 from invertwin.storage.folders import replace_file

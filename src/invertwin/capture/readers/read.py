@@ -7,8 +7,8 @@ from invertwin.capture.capture import Capture
 from invertwin.capture.chirp_capture import ChirpCapture
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.readers import described_arrays, described_sweeps
-from invertwin.capture.refusals import refusal
 from invertwin.radar.boards import Mounting, TxRxArrays
+from invertwin.refusals import refusal
 
 
 def read(

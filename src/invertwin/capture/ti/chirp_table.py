@@ -7,8 +7,8 @@ from string import Template
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings, shortest_loop
-from invertwin.capture.refusals import refusal
 from invertwin.constants import read_table
+from invertwin.refusals import refusal
 
 FIELDS = read_table("invertwin.capture.ti", "fields.toml")
 """Names and places of numbers in both kinds of file."""

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from invertwin.capture.chirps import ChirpData, ChirpSettings
-from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.capture.ti import layouts
 from invertwin.capture.ti.mmwave_studio import read_studio, setup_files
 from invertwin.capture.ti.sdk_cfg import read_cfg
 from invertwin.checks import check_choice
 from invertwin.errors import InputError
 from invertwin.radar.waveform import PhysicsWarning
+from invertwin.refusals import refusal, refusal_text
 from invertwin.runtime.memory import require_memory
 from invertwin.storage.folders import replace_file
 from invertwin.storage.untrusted import existing_file, safe_reader

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.prediction import covariances, prediction_coefficients
-from invertwin.capture.refusals import refusal_text
 from invertwin.capture.ti.device_limits import frame_duration
 from invertwin.checks import check_choice, checked_count
 from invertwin.errors import InputError
+from invertwin.refusals import refusal_text
 
 LANE_COUNT = 4
 _MAX_WORDS = 2**17  # that are looked at

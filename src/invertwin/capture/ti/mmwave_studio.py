@@ -7,9 +7,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
-from invertwin.capture.refusals import refusal
 from invertwin.capture.ti import chirp_table
 from invertwin.errors import InputError
+from invertwin.refusals import refusal
 from invertwin.storage.folders import replace_file, write_text_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
 

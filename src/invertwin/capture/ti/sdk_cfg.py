@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from invertwin.capture.chirps import ChirpSettings
-from invertwin.capture.refusals import refusal, refusal_text
 from invertwin.capture.ti import chirp_table, device_limits
 from invertwin.errors import InputError, PhysicsWarning
+from invertwin.refusals import refusal, refusal_text
 from invertwin.storage.folders import write_text_file
 from invertwin.storage.untrusted import read_text, safe_reader
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.channel import Grid, Sampling
 from invertwin.cli.estimate import SensorSetup, estimate_rcs_resources, require_resources
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
@@ -26,6 +25,7 @@ from invertwin.inversion.gradcheck.lines import make_line
 from invertwin.links import MapPlane, ReceiverPoints
 from invertwin.models import PanelMap, RcsMap, SurrogateMap
 from invertwin.radar.radar import Radar
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.signatures import Signature
 from invertwin.storage.run_folder import RunFolder

@@ -18,11 +18,11 @@ from invertwin.checks import checked_number
 from invertwin.cli import report
 from invertwin.cli.inputs import find_plugin_recording
 from invertwin.cli.options import LookOptions, RecordingOptions
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.errors import InputError, PhysicsWarning
 from invertwin.plotting import MapPanel
 from invertwin.radar.boards import Mounting
+from invertwin.refusals import refusal
 from invertwin.registry.kinds import registry
 from invertwin.storage.run_folder import RunFolder
 

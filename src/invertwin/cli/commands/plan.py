@@ -11,7 +11,6 @@ from invertwin.cli.fits.kinds import build_problem
 from invertwin.cli.fits.problem import Problem, make_observations, make_unknowns, stage_runs
 from invertwin.cli.fits.radar_models import with_new_recording
 from invertwin.cli.fits.scores import error_bar_table
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, load_texts, write_report
 from invertwin.cli.run_file import require_section
 from invertwin.cli.schema import PlanTable, RunFile, SimulatedData, build
@@ -19,6 +18,7 @@ from invertwin.cli.terminal import show_progress
 from invertwin.inversion import plan_error_bars, prepare_fit
 from invertwin.inversion.confidence.planning import fit_errors
 from invertwin.inversion.confidence.report import error_bar_metrics
+from invertwin.refusals import refusal
 from invertwin.runtime.progress import track
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder

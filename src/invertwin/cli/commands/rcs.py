@@ -12,12 +12,12 @@ from torch import Tensor
 from invertwin import plotting
 from invertwin.capture import load_rcs
 from invertwin.cli.estimate import estimate_rcs_resources
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, load_texts, save_picture, write_report
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.signature import RcsMeasurement, RcsTable
 from invertwin.cli.terminal import RunBatch
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.signatures import Signature, aspect_directions, to_dbsm
 from invertwin.storage.run_folder import RunFolder

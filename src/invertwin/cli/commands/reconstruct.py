@@ -21,13 +21,13 @@ from invertwin.cli.fits.scores import drop_histories
 from invertwin.cli.fits.shape_scores import check_measures
 from invertwin.cli.fits.spreading import QUIET_CONSOLE, FitWorkers, distribute_fits
 from invertwin.cli.fits.writing import state_positions
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, ReportView, save_picture, write_report
 from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile, SimulatedData
 from invertwin.cli.terminal import show_progress
 from invertwin.inversion.confidence.report import confidence_metrics
 from invertwin.inversion.fit import Fit
+from invertwin.refusals import refusal
 from invertwin.scene.files import save_mesh
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import CHECKPOINT, RunFolder

@@ -20,7 +20,6 @@ from invertwin.cli import report
 from invertwin.cli.commands.look import describe_frame, describe_peak, draw_spectrogram
 from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import require_simulated_data, simulate_chirp_beats, simulate_exact
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportPicture, ReportTable, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RawTable, RunFile, build
@@ -28,6 +27,7 @@ from invertwin.models.radar import SurrogateMap, surrogate_correlation
 from invertwin.radar import FMCW, doppler_maps
 from invertwin.radar.processing.doppler_maps import find_peak
 from invertwin.radar.radar import Radar
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.scene.files import save_mesh
 from invertwin.storage.run_folder import RunFolder

@@ -17,7 +17,6 @@ from invertwin.cli.fits.displays import StepRecorder, steps_path
 from invertwin.cli.fits.problem import Fits, Problem, Row, Start
 from invertwin.cli.fits.shape_scores import CURVE_KEY, make_shape_metric
 from invertwin.cli.fits.spreading import fit_file_stem
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import format_place
 from invertwin.cli.schema import build
 from invertwin.discovery.imaging.point_detections import find_image_peak
@@ -26,6 +25,7 @@ from invertwin.inversion.callbacks import stage_checkpoint_path
 from invertwin.inversion.fit import Fit, parameter_values
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
+from invertwin.refusals import refusal
 from invertwin.scene import Mesh, Scene, signed_distance
 from invertwin.scene.scene import displace
 from invertwin.seeds import derive_seed

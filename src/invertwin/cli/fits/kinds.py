@@ -8,10 +8,10 @@ from invertwin.cli.fits.problem import DataKind, Problem
 from invertwin.cli.fits.radar_maps import RadarMaps
 from invertwin.cli.fits.received_levels import ReceivedLevels
 from invertwin.cli.fits.transmitter_coverage import TransmitterCoverage
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.shape_tables import MovingTargetParameter
+from invertwin.refusals import refusal
 
 # By the section that tells it, the first that is there.
 _KINDS = {"placement": PanelCoverage, "aim": TransmitterCoverage, "map": ReceivedLevels}

@@ -20,7 +20,6 @@ from invertwin.cli.exact_signals import simulate_chirp_beats
 from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SimulatedData, build
 from invertwin.cli.schema.motion_tables import scene_at_start
@@ -32,6 +31,7 @@ from invertwin.inversion import Reconstruction, Unknown
 from invertwin.models.doppler import RangeDopplerMap
 from invertwin.plotting import RATE_LABEL, U_LABEL, MapPanel
 from invertwin.radar import doppler_maps
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.storage.run_folder import RunFolder
 

@@ -13,7 +13,6 @@ from invertwin.channel import Densities, Grid, Sampling
 from invertwin.cli.estimate import SensorSetup
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.fits.problem import Problem, SensorData, about_sensor, sensor_runs, stage_runs
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile, SamplingBase, SimulatedData, build
 from invertwin.cli.schema.recordings import DEFAULT_POINTS_PER_M2, build_capture
@@ -23,6 +22,7 @@ from invertwin.inversion import InitialPoseEstimator, pose_error
 from invertwin.inversion.initialisation.detections import estimate_density
 from invertwin.models import ExactMap, FacetMap, SurrogateMap
 from invertwin.radar.surrogate.surrogate import Surrogate
+from invertwin.refusals import refusal, refusal_text
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 

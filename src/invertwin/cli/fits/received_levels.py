@@ -17,7 +17,6 @@ from invertwin.cli.fits import problem as problems
 from invertwin.cli.fits.problem import DataKind, Fits, Problem, Row, SensorData, Start, Summary
 from invertwin.cli.fits.scores import error_bar_table, score_fit
 from invertwin.cli.fits.writing import describe_outcome, parameter_values
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
@@ -29,6 +28,7 @@ from invertwin.inversion import Reconstruction, Unknown
 from invertwin.inversion.confidence.ambiguities import REJECTION_ZSCORE, difference_score
 from invertwin.links import MapPlane, ReceiverPoints, Transmitters
 from invertwin.models.radio import RadioMap
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder

@@ -15,11 +15,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import to_minimal_toml, validate_run
 from invertwin.cli.schema import RunFile
 from invertwin.cli.terminal import show_progress
 from invertwin.errors import PhysicsWarning
+from invertwin.refusals import refusal
 from invertwin.runtime.engines import Engine, run_jobs
 from invertwin.runtime.progress import track
 from invertwin.storage.folders import PARTS, UNFINISHED

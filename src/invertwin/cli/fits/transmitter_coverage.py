@@ -19,13 +19,13 @@ from invertwin.cli.fits.received_levels import (
 )
 from invertwin.cli.fits.scores import error_bar_table
 from invertwin.cli.fits.writing import parameter_values
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable, format_place, quantity_table, save_picture
 from invertwin.cli.run_file import prefix_errors, require_section
 from invertwin.cli.schema import RunFile
 from invertwin.errors import InputError
 from invertwin.inversion import Reconstruction
 from invertwin.links import MapPlane, ReceiverPoints
+from invertwin.refusals import refusal
 from invertwin.scene import Scene
 from invertwin.seeds import derive_seed
 from invertwin.storage.run_folder import RunFolder

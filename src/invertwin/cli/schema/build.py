@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors, require_section, unknown_object_message
 from invertwin.cli.schema import RunFile, SceneFileTable
 from invertwin.cli.schema.sensors import grid as grid
@@ -18,6 +17,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.tangents import ParameterChange, parameter_changes
 from invertwin.inversion.loss import CorrelationLoss, RatioLoss, SpectrumLoss
 from invertwin.links import PanelPlacement
+from invertwin.refusals import refusal
 from invertwin.registry.kinds import ConstructorTable
 from invertwin.scene import Mesh, Object, Scene, SkinnedBody, merge_meshes
 from invertwin.scene.files import CONCRETE, load_scene_xml

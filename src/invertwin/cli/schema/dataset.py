@@ -5,10 +5,10 @@ from typing import Annotated, Any, Literal
 from annotated_types import MinLen
 from pydantic import model_validator
 
-from invertwin.cli.refusals import refusal_text
 from invertwin.cli.schema.variation import parse_key_path
 from invertwin.datasets import Choice, Integer, LogUniform, Normal, Presence, Uniform
 from invertwin.limits import Count
+from invertwin.refusals import refusal_text
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry
 from invertwin.registry.section import PrintableText, Section, raise_key_error
 

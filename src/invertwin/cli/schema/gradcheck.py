@@ -5,9 +5,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import GetCoreSchemaHandler, model_validator
 
-from invertwin.cli.refusals import refusal_text
 from invertwin.inversion import GaussianBump, GradcheckSettings
 from invertwin.limits import Count, Positive
+from invertwin.refusals import refusal_text
 from invertwin.registry.kinds import ConstructorTable, OneOf, number_or_list, registry
 from invertwin.registry.section import Depth, check_presence, raise_key_error
 

@@ -10,9 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from invertwin.cli.refusals import refusal
 from invertwin.cli.report import ReportTable
 from invertwin.limits import MAX_NUMBER
+from invertwin.refusals import refusal
 from invertwin.registry.kinds import PLUGINS
 from invertwin.registry.section import suggest_name
 from invertwin.runtime.doctor import cache_folder

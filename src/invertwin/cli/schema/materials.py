@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 from pydantic import model_validator
 
 from invertwin import scene
-from invertwin.cli.refusals import refusal, refusal_text
+from invertwin.refusals import refusal, refusal_text
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, ValueFormat
 from invertwin.registry.section import InputPath, Section, raise_key_error
 from invertwin.scene.material.materials import Medium

@@ -2,10 +2,10 @@
 
 from torch import Tensor
 
-from invertwin.cli.refusals import refusal
 from invertwin.cli.run_file import prefix_errors
 from invertwin.cli.schema import RunFile
 from invertwin.cli.schema.shape_tables import ObjectTable, joint_positions, require_body
+from invertwin.refusals import refusal
 from invertwin.scene import BodyTemplate, MovingScene, ObjectMotion, Scene, Waving
 from invertwin.scene.people.gait import PersonMotion
 

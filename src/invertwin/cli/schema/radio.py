@@ -7,7 +7,6 @@ from annotated_types import MinLen
 from pydantic import model_validator
 from torch import Tensor
 
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.cli.schema.fits import SamplingBase
 from invertwin.cli.schema.sensors import Orientation, PolarisationValue
 from invertwin.limits import Count, NonNegative
@@ -15,6 +14,7 @@ from invertwin.links import AntennaMount, PropagationSettings, Reverberation, Tr
 from invertwin.links.metasurface.coverage import soft_quantile
 from invertwin.links.transmitters import FreeSpace
 from invertwin.models.radio import RadioMap
+from invertwin.refusals import refusal, refusal_text
 from invertwin.registry.kinds import OneOf, TableOf, registry
 from invertwin.registry.section import Section, Seed, Vector, prefix_errors, raise_key_error
 from invertwin.scene import AntennaArray, Scene

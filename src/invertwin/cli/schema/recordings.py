@@ -9,10 +9,10 @@ from pydantic import model_validator
 from invertwin.capture import Capture, ChannelCalibration, ChirpCapture, ChirpData, ti
 from invertwin.capture.readers import described_arrays, described_sweeps
 from invertwin.capture.readers.radar_fields import WAVEFORMS
-from invertwin.cli.refusals import refusal
 from invertwin.cli.schema.sensors import RadarPoseTable
 from invertwin.limits import Count, Decibels, Positive
 from invertwin.radar.boards import Mounting
+from invertwin.refusals import refusal
 from invertwin.registry import section
 from invertwin.registry.kinds import ConstructorTable, FormOf, KindGroup, Registry, registry
 from invertwin.registry.section import InputPath, prefix_errors

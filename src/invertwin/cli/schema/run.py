@@ -10,7 +10,6 @@ from pydantic import Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from invertwin.channel.sampling import ALL_OTHERS
-from invertwin.cli.refusals import refusal_text
 from invertwin.cli.schema import fits
 from invertwin.cli.schema.camera_tables import AnyCamera, AnyImage
 from invertwin.cli.schema.dataset import DatasetTable
@@ -28,6 +27,7 @@ from invertwin.errors import InputError
 from invertwin.inversion.gradcheck.gradcheck import GradcheckSettings
 from invertwin.limits import NonNegative, Positive
 from invertwin.radar.surrogate.surrogate import Surrogate
+from invertwin.refusals import refusal_text
 from invertwin.registry import section
 from invertwin.registry.kinds import NameOf, OneOf, TableOf, load_plugins, registry
 from invertwin.registry.section import Section, Vector, raise_key_error

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from invertwin import scene as scenes
 from invertwin.checks import ArrayLike, Point, check_choice
-from invertwin.cli.refusals import refusal
 from invertwin.errors import InputError
 from invertwin.inversion.regularization import Laplacian, LatentNorm, Regularizer
 from invertwin.limits import Axes, Count, NonNegative, Positive
 from invertwin.links.metasurface.wall_path import PanelPlacement
 from invertwin.radar import RadarPose, RadarTrajectory
+from invertwin.refusals import refusal
 from invertwin.registry.kinds import ConstructorTable, KindGroup, OneOf, Registry
 from invertwin.registry.section import Counts, InputPath, Vector, prefix_errors
 from invertwin.scene.files import load_mesh

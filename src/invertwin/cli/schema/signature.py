@@ -7,8 +7,8 @@ from annotated_types import MinLen
 from pydantic import model_validator
 from torch import Tensor
 
-from invertwin.cli.refusals import refusal_text
 from invertwin.limits import CountOfTwo, Positive
+from invertwin.refusals import refusal_text
 from invertwin.registry.kinds import ConstructorTable, FormOf, OneOf
 from invertwin.registry.section import InputPath, Section, prefix_errors, raise_key_error
 from invertwin.signatures import Signature, aspect_directions

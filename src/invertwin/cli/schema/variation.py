@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from invertwin.cli.refusals import refusal, refusal_text
 from invertwin.datasets import UNCHANGED
 from invertwin.errors import InputError
+from invertwin.refusals import refusal, refusal_text
 from invertwin.registry.section import raise_key_error, suggest_name
 from invertwin.seeds import derive_seed
 

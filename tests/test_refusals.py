@@ -1,16 +1,12 @@
-"""Refusals of the command line and of recordings: every text is used, and filled completely."""
+"""Refusals: every text is used, and filled completely."""
 
 import ast
 from pathlib import Path
 from string import Formatter
-from types import ModuleType
 
-import pytest
-
-import invertwin.capture
-import invertwin.cli
-from invertwin.cli.refusals import refusal, refusal_text
+import invertwin
 from invertwin.constants import read_table
+from invertwin.refusals import refusal, refusal_text
 
 _FUNCTIONS = (refusal.__name__, refusal_text.__name__)
 
@@ -22,10 +18,10 @@ def _count_places(text: str) -> int:
     return len(numbered) if numbered else len(fields)
 
 
-def _used_values(package: ModuleType) -> dict[str, int]:
+def _used_values() -> dict[str, int]:
     """Number of values with which the modules fill texts, by their names."""
     used: dict[str, int] = {}
-    for file in Path(str(package.__file__)).parent.rglob("*.py"):
+    for file in Path(invertwin.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in _FUNCTIONS:
                 name, *values = node.args
@@ -34,11 +30,10 @@ def _used_values(package: ModuleType) -> dict[str, int]:
     return used
 
 
-@pytest.mark.parametrize("package", [invertwin.cli, invertwin.capture])
-def test_every_text_is_used_and_filled(package):
-    table = read_table(package.__name__, "refusals.toml")
+def test_every_text_is_used_and_filled():
+    table = read_table("invertwin", "refusals.toml")
     texts = {f"{part}.{key}": text for part, rows in table.items() for key, text in rows.items()}
-    assert _used_values(package) == {name: _count_places(text) for name, text in texts.items()}
+    assert _used_values() == {name: _count_places(text) for name, text in texts.items()}
 
 
 def test_a_refusal_has_its_text_and_its_key():

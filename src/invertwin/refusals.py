@@ -1,4 +1,4 @@
-"""Errors of the command line whose texts take more than a line: those of refusals.toml."""
+"""Errors whose texts take more than a line: those of refusals.toml."""
 
 from typing import Any
 
@@ -25,4 +25,4 @@ def refusal_text(name: str, *values: Any) -> str:
         *values: What the text leaves open.
     """
     section, key = name.split(".")
-    return read_table("invertwin.cli", "refusals.toml")[section][key].format(*values)
+    return read_table("invertwin", "refusals.toml")[section][key].format(*values)
