@@ -34,11 +34,11 @@ class PhysicsWarning(UserWarning):
 
 
 @contextmanager
-def locate_errors(where: str) -> Iterator[None]:
+def locate_errors(where: object) -> Iterator[None]:
     """Put the place of a fault before the text of an InputError.
 
     Args:
-        where: The place, such as the path of a file.
+        where: The place, such as the path of a file; what ``str`` makes of it is shown.
 
     Raises:
         InputError: The block has raised one.

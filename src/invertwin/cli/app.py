@@ -20,9 +20,8 @@ from invertwin.cli import inputs
 from invertwin.cli import options as command_options
 from invertwin.cli.options import FileArgument, ResumableOptions, argument, console, option
 from invertwin.cli.report import ReportTable, use_plain_style
-from invertwin.cli.run_file import prefix_file_errors
 from invertwin.cli.terminal import load_runs, print_tables, run_each, run_in_folder, show_progress
-from invertwin.errors import InputError, exit_on_interrupt, to_one_line
+from invertwin.errors import InputError, exit_on_interrupt, locate_errors, to_one_line
 from invertwin.refusals import refusal
 from invertwin.runtime.threads import available_threads
 from invertwin.storage.folders import convert_os_errors
@@ -100,7 +99,7 @@ def simulate(options: command_options.RunOptions, file: FileArgument) -> None:
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         run = runs[file.stem]
-        with prefix_file_errors(file), show_progress(console):
+        with locate_errors(file), show_progress(console):
             if _simulates_coverage(run):
                 from invertwin.cli.commands.coverage import run_coverage
 
@@ -130,7 +129,7 @@ def dataset(options: command_options.DatasetOptions, file: FileArgument) -> None
     chosen = replace(options, out=command.part_folder(options.out or Path("out", file.stem), part))
 
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
-        with prefix_file_errors(file), show_progress(console):
+        with locate_errors(file), show_progress(console):
             workers = options.workers or available_threads()
             return command.run_dataset(runs[file.stem], folder, part, options.engine, workers)
 
@@ -151,7 +150,7 @@ def plan(options: ResumableOptions, file: FileArgument) -> None:
     def work(folder: RunFolder) -> tuple[list[ReportTable], str]:
         from invertwin.cli.commands.plan import run_plan
 
-        with prefix_file_errors(file):
+        with locate_errors(file):
             return run_plan(runs[file.stem], folder, console)
 
     run_in_folder(options, Path("out", file.stem), work, runs)
@@ -166,7 +165,7 @@ def check(file: FileArgument, backend: command_options.BackendOption = None) -> 
     use_plain_style()
     from invertwin.cli.commands.check import run_check
 
-    with prefix_file_errors(file):
+    with locate_errors(file):
         tables, line = run_check(run)
     print_tables(tables)
     console.print(line, markup=False, soft_wrap=True)
@@ -341,7 +340,7 @@ def _run_one_reconstruction(file: Path, options: command_options.FitOptions, def
         from invertwin.cli.fits.spreading import FitWorkers
 
         workers = FitWorkers.from_options(options.engine, options.workers)
-        with prefix_file_errors(file):
+        with locate_errors(file):
             return run_reconstruct(runs[file.stem], folder, console, workers, view=options.view)
 
     run_in_folder(options, default, work, runs)

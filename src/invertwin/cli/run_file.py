@@ -8,7 +8,6 @@ import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -84,15 +83,6 @@ def is_run_file(path: Path) -> bool:
         return "task" in tomllib.loads(read_text(path))
     except (ValueError, RecursionError):  # of thousands of levels
         return False
-
-
-@contextmanager
-def prefix_file_errors(path: Path) -> Iterator[None]:
-    """Add the name of the run file to errors."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def validate_run(raw: dict[str, Any], source: Path) -> Any:

@@ -17,7 +17,8 @@ from rich.text import Text
 from invertwin.cli.inputs import require_files
 from invertwin.cli.options import OutputOptions, ResumableOptions, RunOptions, console
 from invertwin.cli.report import ReportTable, format_cell, is_numeric_cell, use_plain_style
-from invertwin.cli.run_file import load_run, prefix_file_errors, require_section, to_toml
+from invertwin.cli.run_file import load_run, require_section, to_toml
+from invertwin.errors import locate_errors
 from invertwin.refusals import refusal
 from invertwin.runtime.progress import format_duration, progress_callback
 from invertwin.storage.folders import PARTS
@@ -86,7 +87,7 @@ def load_runs(
         cure = "add it"
         if other != command:
             cure = f"its task is {run.task}: use `invertwin {other} {quote(str(file))}`"
-        with prefix_file_errors(file):
+        with locate_errors(file):
             for section in sections(run) if callable(sections) else sections:
                 require_section(run, section, command, cure)
         seeded = {} if options.seed is None else {"seed": options.seed}
@@ -121,7 +122,7 @@ class RunBatch:
             part = f"{PARTS}/{name}.json"
             found = self.folder.read_json(part)
             if found is None:
-                with prefix_file_errors(self.files[name]):
+                with locate_errors(self.files[name]):
                     found = compute(name, run)
                 self.folder.write_json(part, found)
             yield name, run, found

@@ -124,7 +124,7 @@ def _load_with(
                 vertices = _GLTF.inverse.vectors(torch.from_numpy(vertices)).numpy()
             faces = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
             found[name] = vertices * _METRES[unit], faces
-    with locate_errors(str(path)):
+    with locate_errors(path):
         # Check the raw file first: merging would hide its defects.
         for vertices, faces in found.values():
             Mesh(torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()))
@@ -212,7 +212,7 @@ def load_scene_xml(
     with untrusted.convert_read_errors(file, "an XML scene"):
         root = ElementTree.parse(file).getroot()
         require_at_most(len(root), _MAX_SHAPES, "shapes", "join those of one material")
-    with locate_errors(str(file)):
+    with locate_errors(file):
         return _build_scene(root, file, dict(materials or {}), default)
 
 

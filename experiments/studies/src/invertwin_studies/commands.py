@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from invertwin.cli.options import FileArgument, OutputOptions, RunOptions, with_options
+from invertwin.errors import locate_errors
 
 if TYPE_CHECKING:
     from invertwin.cli.report import ReportTable
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 @with_options(RunOptions)
 def loss_scan(options: RunOptions, file: FileArgument) -> None:
     """Show the losses of signals and of the surrogate along a line."""
-    from invertwin.cli.run_file import prefix_file_errors
     from invertwin.cli.terminal import load_runs, run_in_folder
 
     runs = load_runs([file], options, "loss-scan", ("loss_scan", "radar", "grid", "data"))
@@ -23,7 +23,7 @@ def loss_scan(options: RunOptions, file: FileArgument) -> None:
     def work(folder: "RunFolder") -> "tuple[list[ReportTable], str]":
         from invertwin_studies.loss_scan import run_loss_scan
 
-        with prefix_file_errors(file):
+        with locate_errors(file):
             return run_loss_scan(runs[file.stem], folder), ""
 
     run_in_folder(options, Path("out", file.stem), work, runs)

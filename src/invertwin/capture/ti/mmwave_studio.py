@@ -8,7 +8,7 @@ from typing import Any
 
 from invertwin.capture.chirps import ChirpSettings
 from invertwin.capture.ti import chirp_table
-from invertwin.errors import InputError
+from invertwin.errors import InputError, locate_errors
 from invertwin.refusals import refusal
 from invertwin.storage.folders import replace_file, write_text_file
 from invertwin.storage.untrusted import convert_read_errors, existing_file, read_text, safe_reader
@@ -43,11 +43,8 @@ def read_studio(path: str | Path) -> ChirpSettings:
         path = _sibling_path(path, str(content["configUsed"]))
         content = _load_json(path)
     do = "save the settings again with mmWave Studio"
-    try:
-        with convert_read_errors(path, "the keys of mmWave Studio", do):
-            return _parse_settings(content, device)
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from error
+    with locate_errors(path.name), convert_read_errors(path, "the keys of mmWave Studio", do):
+        return _parse_settings(content, device)
 
 
 @safe_reader("a setup of mmWave Studio", "save it again with mmWave Studio")

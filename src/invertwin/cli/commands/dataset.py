@@ -19,11 +19,11 @@ from invertwin.cli.estimate import SensorSetup, require_resources
 from invertwin.cli.exact_signals import simulate_chirp_beats, simulate_exact, warn_if_aliased
 from invertwin.cli.inputs import DATASET_SECTIONS
 from invertwin.cli.report import ReportTable, quantity_table, save_picture, write_report
-from invertwin.cli.run_file import load_run, prefix_file_errors, to_toml, validate_run
+from invertwin.cli.run_file import load_run, to_toml, validate_run
 from invertwin.cli.schema import RunFile, build, motion_tables
 from invertwin.cli.schema.variation import draw_sample
 from invertwin.datasets import SampleDataset, labels, shards
-from invertwin.errors import InputError, PhysicsWarning
+from invertwin.errors import InputError, PhysicsWarning, locate_errors
 from invertwin.radar.processing import doppler
 from invertwin.registry.section import require_section
 from invertwin.runtime.engines import Engine, run_jobs
@@ -74,14 +74,14 @@ def dataset(
     """
     file = Path(run_file)
     run = load_run(file)
-    with prefix_file_errors(file):
+    with locate_errors(file):
         for section in DATASET_SECTIONS:
             require_section(run, section, "dataset")
     run = run if seed is None else run.model_copy(update={"seed": seed})
     place = part_folder(Path(folder), part)
     with open_run(place, {"run": to_toml(run)}, overwrite=overwrite, resume=resume) as opened:
         if not opened.complete:
-            with prefix_file_errors(file):
+            with locate_errors(file):
                 run_dataset(run, opened, part, engine, workers)
     return SampleDataset(place)
 
@@ -128,7 +128,7 @@ def run_dataset(
     wanted = shards.shard_ranges(table.samples, table.shard, part)
     # A sample is built before any work is done: its errors and its warnings come at once.
     own = make_sample_run(run, wanted[0][1])
-    with prefix_file_errors(Path(f"sample {wanted[0][1]}")):
+    with locate_errors(f"sample {wanted[0][1]}"):
         scene, sensor = _build_sample(own)
         require_resources(own, scene, {"": sensor})
         if own.chirps is not None:
@@ -187,7 +187,7 @@ def make_sample(run: RunFile, index: int) -> dict[str, bytes]:
         index: Index of the sample.
     """
     own = make_sample_run(run, index)
-    with prefix_file_errors(Path(f"sample {index}")):
+    with locate_errors(f"sample {index}"):
         scene, sensor = _build_sample(own)
         table = require_section(run, "dataset", "a data set")
         arrays = _simulate_signals(own, scene, sensor, table)
@@ -216,7 +216,7 @@ def make_sample_run(run: RunFile, index: int) -> RunFile:
     Raises:
         InputError: Drawn values that are no run file together; the message names the sample.
     """
-    with prefix_file_errors(Path(f"sample {index}")):
+    with locate_errors(f"sample {index}"):
         raw = draw_sample(run, run.dump_without_dataset(), index)
     return validate_run(raw, Path(f"sample {index}"))
 

@@ -16,10 +16,10 @@ from invertwin.channel import Grid
 from invertwin.cli.fits.displays import VIEW_FILE, placement_layers
 from invertwin.cli.fits.radar_models import build_sensors
 from invertwin.cli.inputs import find_viewed_file
-from invertwin.cli.run_file import load_run, prefix_file_errors
+from invertwin.cli.run_file import load_run
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.motion_tables import build_moving_scene
-from invertwin.errors import InputError
+from invertwin.errors import InputError, locate_errors
 from invertwin.radar import Radar
 from invertwin.scene import Scene
 from invertwin.storage.folders import write_text_file
@@ -75,7 +75,7 @@ def _display_of_run(
     file: Path, folder: Path | None
 ) -> tuple[viewer.Display, dict[str, viewer.InteractiveSensor]]:
     run: RunFile = load_run(file)
-    with prefix_file_errors(file):
+    with locate_errors(file):
         scene, truth = build.scene(run), build.true_scene(run)
         radars = _build_radars(run)
         names = run.fitted_objects or list(run.truth)
