@@ -18,7 +18,7 @@ from invertwin.radar import Radar, SampledWaveform
 from invertwin.radar.signal.range_profile import fft_bins
 from invertwin.refusals import refusal
 from invertwin.runtime.memory import format_gigabytes, free_memory, require_at_most
-from invertwin.scene import Mesh, Object, Scene
+from invertwin.scene import Object, Scene
 from invertwin.scene.scene import warn_if_purely_specular
 
 # Bytes, measured as peaks of whole runs (benchmarks are in docs/limitations.md).
@@ -231,7 +231,7 @@ def _simulation_items(
     """Return the memory of exact signals' paths, and their number over all frames."""
     with prefix_errors("data.points_per_m2"):
         rough = resolve_densities(scene, data.points_per_m2)
-    areas = {name: Mesh(scene[name].vertices, scene[name].mesh.faces).area for name in rough}
+    areas = {name: scene[name].world_mesh.area for name in rough}
     area = sum(areas.values())
     points = sum(areas[name] * density for name, density in rough.items())
     each = _POINT_BYTES + frames * _PATH_BYTES

@@ -48,8 +48,7 @@ def object_labels(
         low, high = own.amin(0), own.amax(0)
         still = torch.zeros(1, 3, dtype=torch.float64)
         velocity = still if item.velocity is None else item.velocity.reshape(-1, 3)
-        a, b, c = own.detach()[item.mesh.faces].unbind(1)
-        areas = 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+        areas = item.mesh.triangle_areas.detach()
         found: dict[str, Any] = {
             "name": name,
             "class": classes.get(name, name),
@@ -113,7 +112,7 @@ def triangle_visibility(scene: Scene, radar: Radar) -> dict[str, Float[Tensor, "
         scene: Surfaces in the world.
         radar: Its positions, one a frame; antennas are not distinguished.
     """
-    meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in scene.objects.values()]
+    meshes = [item.world_mesh for item in scene.objects.values()]
     points = [_sample_triangles(mesh) for mesh in meshes]
     flat, whole = torch.cat([part.reshape(-1, 3) for part in points]), concatenate_meshes(meshes)
     frames = [visible_points(whole, flat, place[None]) for place in radar.positions.detach()]

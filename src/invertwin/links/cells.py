@@ -307,8 +307,7 @@ class MapMesh(Cells):
     @property
     def areas(self) -> Float64[Tensor, " cell"]:
         """Areas of the cells [m²]."""
-        a, b, c = self.mesh.vertices[self.mesh.faces].unbind(1)
-        return torch.linalg.cross(b - a, c - a).norm(dim=1) / 2
+        return self.mesh.triangle_areas
 
     def surface(self) -> Mesh:
         """The mesh. See ``Cells.surface``."""

@@ -12,7 +12,7 @@ from invertwin.errors import InputError
 from invertwin.limits import Axes, NonNegative
 from invertwin.links.responses import AntennaMount
 from invertwin.links.reverberation import NEPERS_PER_DB, Reverberation
-from invertwin.scene import Mesh, Scene, signed_distance
+from invertwin.scene import Scene, signed_distance
 from invertwin.scene.parameters import Coordinate, axes_mask, free_part, position_coordinates
 
 
@@ -74,7 +74,7 @@ class FreeSpace:
     def __init__(self, scene: Scene, low: ArrayLike, high: ArrayLike, clear: float) -> None:
         box = torch.stack([torch.as_tensor(end, dtype=torch.float64) for end in (low, high)])
         items = scene.objects.values()
-        self._meshes = [Mesh(item.vertices.detach(), item.mesh.faces) for item in items]
+        self._meshes = [item.world_mesh for item in items]
         self._signs = [
             -1.0 if bool((signed_distance(mesh, box) < 0).all()) else 1.0 for mesh in self._meshes
         ]

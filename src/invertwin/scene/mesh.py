@@ -78,10 +78,15 @@ class Mesh:
         return (self.vertices.amin(0) + self.vertices.amax(0)) / 2
 
     @property
+    def triangle_areas(self) -> Float64[Tensor, " f"]:
+        """Areas of the triangles [m²]."""
+        a, b, c = self.vertices[self.faces].unbind(1)
+        return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
+
+    @property
     def area(self) -> float:
         """Surface area [m²], without gradient."""
-        a, b, c = self.vertices.detach()[self.faces].unbind(1)
-        return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+        return float(self.triangle_areas.detach().sum())
 
     def change_basis(self, basis: Basis) -> "Mesh":
         """Return the mesh along other axes, of the same normals in space."""

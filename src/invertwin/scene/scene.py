@@ -79,6 +79,11 @@ class Object:
         return points if self.pose is None else _transform_points(points, self.pose)
 
     @property
+    def world_mesh(self) -> Mesh:
+        """Mesh in world axes, without derivatives."""
+        return Mesh(self.vertices.detach(), self.mesh.faces)
+
+    @property
     def center(self) -> Float64[Tensor, "3"]:
         """World position [m] of the centre of the mesh's bounding box in the object's frame.
 

@@ -14,16 +14,17 @@ from invertwin.cli.commands.look import AnyRecording, read_recording, warning_ta
 from invertwin.cli.commands.view import load_display
 from invertwin.cli.exact_signals import simulate_exact
 from invertwin.cli.options import TwinOptions, console
-from invertwin.cli.run_file import is_run_file, load_run, prefix_file_errors, require_section
+from invertwin.cli.run_file import is_run_file, load_run, require_section
 from invertwin.cli.schema import RunFile, build
 from invertwin.cli.schema.recordings import SimulatedData
 from invertwin.constants import FRAME
 from invertwin.discovery import DetectedObject, Twin, average_chirps, twin
 from invertwin.discovery.shapes.primitives import MAX_DIELECTRIC_REFLECTANCE
+from invertwin.errors import locate_errors
 from invertwin.inversion.metrics import compare_shapes
 from invertwin.plotting import found as pictures
 from invertwin.plotting import spectrum
-from invertwin.scene import Mesh, RoughDielectric, Scene, merge_meshes, save_mesh
+from invertwin.scene import RoughDielectric, Scene, merge_meshes, save_mesh
 from invertwin.storage.folders import PARTS
 from invertwin.storage.run_folder import RunFolder
 from invertwin.viewer import view_html
@@ -72,7 +73,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
         metrics["residual_log_std"] = float(explained.std())
     if truth is not None and scene is not None:
         whole = [
-            merge_meshes([Mesh(o.vertices.detach(), o.mesh.faces) for o in one.objects.values()])
+            merge_meshes([item.world_mesh for item in one.objects.values()])
             for one in (scene, truth)
         ]
         metrics["chamfer_m"] = compare_shapes(*whole, voxel=None).chamfer
@@ -109,7 +110,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
 
 def _load_run_file(options: TwinOptions) -> tuple[AnyRecording, Scene | None, RunFile]:
     """Load the data of a run file, their ground truth, and the run file."""
-    with prefix_file_errors(options.recording):
+    with locate_errors(options.recording):
         run = load_run(options.recording)
         data = require_section(run, "data", "a twin")
         if not isinstance(data, SimulatedData):

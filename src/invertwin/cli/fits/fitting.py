@@ -26,7 +26,7 @@ from invertwin.inversion.fit import Fit, parameter_values
 from invertwin.models.radar import SurrogateMap
 from invertwin.radar.parameters import ClockOffset, RangeBias
 from invertwin.refusals import refusal
-from invertwin.scene import Mesh, Scene, signed_distance
+from invertwin.scene import Scene, signed_distance
 from invertwin.scene.scene import displace
 from invertwin.seeds import derive_seed
 from invertwin.storage.folders import PARTS
@@ -110,7 +110,7 @@ def _find_abandoned_echo(fits: Fits, name: str, capture: Capture) -> torch.Tenso
         near = find_image_peak(capture, center, radius + float((end - center).norm()))
     if near is None or (there is not None and near[1] < _MIN_RELATIVE_PEAK * there[1]):
         return None
-    gap = signed_distance(Mesh(item.vertices.detach(), item.mesh.faces), near[0][None])
+    gap = signed_distance(item.world_mesh, near[0][None])
     return near[0] if float(gap) > cell else None
 
 

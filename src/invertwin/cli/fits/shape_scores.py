@@ -53,7 +53,7 @@ def check_measures(problem: Problem, start: Scene) -> None:
         return
     with prefix_errors("measures"):
         _compare_surfaces(problem, start, table.seen)
-        truth = _world_mesh(problem.truth, table.object)
+        truth = problem.truth[table.object].world_mesh
         if metrics.is_watertight(truth):
             metrics.volume_iou(truth, truth, table.voxel)
 
@@ -98,7 +98,7 @@ def _compare_surfaces(
     table = problem.measures
     assert table is not None
     eyes = [item.sensor.positions.detach() for item in problem.sensor_data.values()]
-    shapes = [_world_mesh(one, table.object) for one in (scene, problem.truth)]
+    shapes = [one[table.object].world_mesh for one in (scene, problem.truth)]
     seen_from, voxel = torch.cat(eyes) if visible_only else None, table.voxel if volume else None
     return metrics.compare_shapes(
         *shapes, seen_from=seen_from, thresholds=table.thresholds, voxel=voxel
@@ -121,8 +121,3 @@ def _shape_metrics(problem: Problem, scene: Scene, visible_only: bool, suffix: s
 
 def _topology_metrics(mesh: Mesh) -> Row:
     return dict(vars(metrics.count_topology(mesh))) if metrics.is_watertight(mesh) else {}
-
-
-def _world_mesh(scene: Scene, name: str) -> Mesh:
-    """The object's mesh in the world."""
-    return Mesh(scene[name].vertices.detach(), scene[name].mesh.faces)

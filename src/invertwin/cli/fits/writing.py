@@ -14,7 +14,7 @@ from invertwin.cli.fits.scores import ANGLES, DOUBTED, error_bar_table
 from invertwin.cli.fits.shape_scores import CURVE_KEY, is_shape_key, shape_label, short_label
 from invertwin.cli.report import ReportPicture, ReportTable, format_cell, format_place, load_texts
 from invertwin.cli.schema import RunFile, SimulatedData
-from invertwin.scene import Mesh, Scene
+from invertwin.scene import Scene
 from invertwin.scene.material.values import RANGES
 from invertwin.scene.shape_models.density import replace_clouds
 from invertwin.storage.run_folder import RunFolder
@@ -248,8 +248,7 @@ def _draw_turntable(problem: Problem, ends: Mapping[str, Scene], name: str) -> b
     scenes = ({"truth": problem.truth} if name in problem.known_objects else {}) | dict(ends)
     turns = problem.first_sensor.sensor.rotations
     up = (0.0, 0.0, 1.0) if turns is None else turns.detach().mean(0)[:, 2]
-    found = {key: scene[name] for key, scene in scenes.items()}
-    meshes = {key: Mesh(item.vertices, item.mesh.faces) for key, item in found.items()}
+    meshes = {key: scene[name].world_mesh for key, scene in scenes.items()}
     return plotting.turntable(meshes, up)
 
 
