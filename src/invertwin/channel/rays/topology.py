@@ -15,7 +15,6 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 from torch._C import _DisableFuncTorch
 
-from invertwin.channel.em.plane_waves import triangle_normals
 from invertwin.channel.rays.arrays import to_float, to_index, to_signed
 from invertwin.channel.rays.backend import VARIANTS, backend, mi, mit
 from invertwin.channel.rays.rigid_groups import find_rigid_groups, is_one_motion
@@ -155,7 +154,8 @@ class Topology:
             vertices: world positions [v, 3] in metres.
         """
         if self._facet_angles is None:
-            normals = triangle_normals(vertices.detach()[self.faces])
+            a, b, c = vertices.detach()[self.faces].unbind(1)
+            normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
             both = self.edge_faces[(self.edge_faces >= 0).sum(1) == 2]
             first, second = normals[both[:, 0]], normals[both[:, 1]]
             angle = 2 * torch.asin((0.5 * (first - second).norm(dim=1)).clamp_max(1.0))
