@@ -73,6 +73,11 @@ class Grid:
         """Bin centres of the second direction cosine (along z, up)."""
         return self._axis(self.v_start, self.v_step, self.v_count)
 
+    @property
+    def in_visible_region(self) -> Bool[Tensor, "u v"]:
+        """True for the bins of directions that exist: u² + v² ≤ 1."""
+        return self.u[:, None].square() + self.v.square() <= 1
+
     @staticmethod
     def _axis(start: float, step: float, count: int) -> Float64[Tensor, " n"]:
         return start + step * torch.arange(count, dtype=torch.float64)

@@ -148,7 +148,7 @@ def point_cloud(
     _check_map(power, detections, expected, "frame, velocity, range, u, v", "point_cloud")
     power, detections = power.to("cpu", torch.float64), detections.cpu()
     count = power.shape[1]
-    seen = _mask_visible_region(power, grid).flatten(3)
+    seen = power.masked_fill(~grid.in_visible_region, 0.0).flatten(3)
     strongest = seen.amax(-1)
     # The axis of range rates is periodic.
     ends = ("nearest", "wrap", "nearest")
@@ -185,7 +185,7 @@ def peaks(
         InputError: Power with gradients, or shapes that do not fit each other.
     """
     _check_map(power, detections, (radar.frame_count, *grid.shape), "frame, range, u, v", "peaks")
-    seen = _mask_visible_region(power.to("cpu", torch.float64), grid)
+    seen = power.to("cpu", torch.float64).masked_fill(~grid.in_visible_region, 0.0)
     highest = torch.from_numpy(maximum_filter(seen.numpy(), (1, 3, 3, 3), mode="nearest"))
     found = detections.cpu()[..., None] & (seen == highest) & (seen > 0)
     frame, place, u, v = torch.nonzero(found, as_tuple=True)
@@ -201,11 +201,6 @@ def _check_map(
     do = f"its axes are {axes}: use the radar and grid that the map was made with"
     check_shape(power, expected, "power", do)
     check_shape(found, expected[:3], "detections beside power", do)
-
-
-def _mask_visible_region(power: Tensor, grid: Grid) -> Tensor:
-    """Set cells with u² + v² > 1 to zero."""
-    return power.masked_fill(grid.u[:, None].square() + grid.v.square() > 1, 0.0)
 
 
 def _refine_points(

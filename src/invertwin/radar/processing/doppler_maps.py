@@ -165,7 +165,7 @@ def _sum_range_rates(
     velocities = doppler.velocity_axis(radar, chirps)
     chunk = max(1, int(_BINS_AT_ONCE / math.prod(grid.shape)))
     total = level.new_zeros(grid.shape, dtype=torch.float64)
-    seen = ((grid.u[:, None].square() + grid.v.square()) <= 1).to(level.device)
+    seen = grid.in_visible_region.to(level.device)
     peaks: list[Peak] = []
     for rows in track(torch.arange(chirps.count).split(chunk), "range rates"):
         power = beamform(cube[rows], radar.frames([0] * len(rows)), grid).double() * seen
@@ -213,7 +213,7 @@ def high_resolution_map(
         power = capon(snapshots, radar, grid)[0]
     else:
         power = music(snapshots, radar, grid, sources="mdl" if sources is None else sources)[0]
-    return power * (grid.u[:, None].square() + grid.v.square() <= 1).to(power.device)
+    return power * grid.in_visible_region.to(power.device)
 
 
 def doppler_snapshots(

@@ -171,7 +171,7 @@ def _resolve_directions(cell: Tensor, radar: Radar, grid: Grid, noise: float) ->
     """Return directions u, v and powers in one cell, the strongest first."""
     channels, left = cell.flatten(), cell
     one = replace(grid, range_start=0.0, range_count=1)
-    seen = grid.u[:, None].square() + grid.v.square() <= 1
+    seen = grid.in_visible_region
     least = -math.log(_FALSE_DIRECTION_RATE / float(seen.sum())) * noise / len(channels)
     places: list[tuple[float, float]] = []
     powers: list[float] = []
