@@ -41,8 +41,9 @@ def test_a_new_run_file_is_valid_and_says_how_to_run_it(kind, tmp_path, monkeypa
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_the_objects_of_the_new_twin_are_found(seed, tmp_path, monkeypatch):
-    """From a rail of eight positions, seed 3 made a person of the low box, 7 cm beside it; from 0.6 m
-    above the ground, heights of 1.1 and 0.7 m were found as 0.6 to 1.25 m.
+    """From a rail of eight positions, seed 3 made a person of the low box, 7 cm beside it.
+
+    From 0.6 m above the ground, heights of 1.1 and 0.7 m were found as 0.6 to 1.25 m.
     """
     monkeypatch.chdir(tmp_path)
     assert call(monkeypatch, "new", "twin") == 0
@@ -50,7 +51,7 @@ def test_the_objects_of_the_new_twin_are_found(seed, tmp_path, monkeypatch):
     (tmp_path / "twin.toml").write_text(text.replace("seed = 1\n", f"seed = {seed}\n"))
     assert call(monkeypatch, "twin", "twin.toml", "-o", "out") == 0
     low, tall = sorted(read_metrics(tmp_path / "out")["things"], key=lambda one: one["position_m"])
-    # As near as a right end of a fit must be; seeds 1 to 8 were within 1.7 cm. A range cell has 5 cm.
+    # As near as a right end of a fit must be; seeds 1 to 8 were within 1.7 cm.
     assert low["position_m"][:2] == pytest.approx([2.3, -0.6], abs=0.03)
     assert tall["position_m"][:2] == pytest.approx([2.8, 0.6], abs=0.03)
     # A prism has the outline of the box.

@@ -155,7 +155,7 @@ def test_a_lobe_that_the_model_lacks_is_found(lobed):
 def test_lobes_are_those_of_rough_dielectrics(lobed):
     _, start, observation = lobed
     wooden = start.replace("letter", material=Dielectric(4.0, scattering=1.0))
-    with pytest.raises(InputError, match="RoughDielectric with known lobes, got none; leave out"):
+    with pytest.raises(InputError, match=r"known permittivity and lobe beside .* got none"):
         reconstruct_with_permittivities(
             wooden, [observation], Pose("letter", axes="xy"), lobes=True, seed=1, **FIT
         )

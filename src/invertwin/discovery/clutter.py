@@ -21,22 +21,14 @@ from invertwin.inversion.confidence.uncertainty import find_known_permittivities
 from invertwin.inversion.observation import Unknown, Unknowns, name_unknowns
 from invertwin.inversion.schedule import Schedule, make_stages
 from invertwin.models import SurrogateMap, WhitenedMap
-from invertwin.scene import (
-    MaterialValues,
-    Mesh,
-    Object,
-    RoughDielectric,
-    Scene,
-    signed_distance,
-)
+from invertwin.scene import MaterialValues, Object, Scene, signed_distance
 
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
 # as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
 _SIGNIFICANT = 3.0  # standard deviations of a permittivity from the stated one
 _LOG_SUSCEPTIBILITIES = -3.0, 4.0  # search for initial permittivities: 1.05 to 56
-_DIFFUSE_SHARES = 0.1, 0.6  # of initial lobes: from a surface without a lobe, it has no effect
-_LOBE_WIDTHS = 0.1, 1.0  # of initial lobes [rad]
+_INITIAL_LOBE = {"diffuse": 0.5, "lobe_width": 0.5}  # [rad]; without any, its width has no effect
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
 
 
@@ -158,16 +150,13 @@ def reconstruct_with_permittivities(
 
     Raises:
         InputError: as ``reconstruct``; all objects are fitted, which leaves the gain unknown, or no
-            fitted object has a known permittivity, or with ``lobes`` no known lobe.
+            fitted object has a known permittivity, with ``lobes`` also a known lobe.
     """
     unknowns = name_unknowns(parameters)
     free = _free_materials(scene, observations, unknowns, lobes=lobes, **options)
-    if not free:
-        problem = "expected a fitted object of known permittivity beside one that is not fitted"
-        raise InputError(f"{problem}, got none; use reconstruct")
-    if lobes and not any("diffuse" in values.raw for values in free.values()):
-        problem = "expected a fitted object of a RoughDielectric with known lobes, got none"
-        raise InputError(f"{problem}; leave out lobes")
+    if not any("diffuse" in values.raw or not lobes for values in free.values()):
+        known = f"known permittivity{' and lobe' if lobes else ''} beside one that is not fitted"
+        raise InputError(f"expected a fitted object of {known}, got none; use reconstruct")
     return inversion.reconstruct(scene, observations, unknowns | name_unknowns(free), **options)
 
 
@@ -187,7 +176,9 @@ def _free_materials(
     fit = inversion.prepare_fit(scene, observations, unknowns, **how)
     objects, values = fit.apply_modules()[0].objects, dict[str, MaterialValues]()
     for name, value in find_known_permittivities(objects).items():
-        lobe = _find_initial_lobe(objects[name]) if lobes else {}
+        stated = [vars(objects[name].material).get(key) for key in _INITIAL_LOBE]
+        is_known = lobes and all(isinstance(one, float) for one in stated)
+        lobe: dict[str, Any] = _INITIAL_LOBE if is_known else {}
         values[f"{name}.permittivity"] = MaterialValues(name, permittivity=value, **lobe)
     fit = fit.copy(*values.values())
     for module in values.values():
@@ -200,20 +191,6 @@ def _free_materials(
 
         loss(minimize_scalar(loss, bounds=_LOG_SUSCEPTIBILITIES, options={"xatol": 0.1}).x)
     return values
-
-
-def _find_initial_lobe(item: Object) -> dict[str, Any]:
-    """Return diffuse share and lobe width of an object, away from the ends of their ranges."""
-    material = item.material
-    if not isinstance(material, RoughDielectric):
-        return {}
-    share, width = material.diffuse, material.lobe_width
-    if not isinstance(share, float) or not isinstance(width, float):
-        return {}
-    return {
-        "diffuse": min(max(share, _DIFFUSE_SHARES[0]), _DIFFUSE_SHARES[1]),
-        "lobe_width": min(max(width, _LOBE_WIDTHS[0]), _LOBE_WIDTHS[1]),
-    }
 
 
 def _has_moved(found: inversion.Reconstruction, key: str, before: Mapping[str, Object]) -> bool:
@@ -354,7 +331,7 @@ def estimate_clutter(
     # The weakest range bin: a level fitted to the whole map would hold the clutter.
     noise = float(estimate_background(power).min()) + law.floor * float(power.mean())
     ranges = float(model.grid.ranges[0]), float(model.grid.ranges[-1])
-    objects = [Mesh(scene[name].vertices.detach(), scene[name].mesh.faces) for name in fitted]
+    objects = [scene[name].world_mesh for name in fitted]
     height = float(torch.stack([mesh.center[2] for mesh in objects]).mean())
     points, _ = image_points(radar, height, ranges, None, None)
     margin = radar.waveform.range_resolution * max(_RESOLUTIONS, model.kernels.range_width)

@@ -155,6 +155,5 @@ class Twin:
         for thing in self.objects:
             if thing.shape is not None:
                 item = make_shape_model(thing.name, thing.shape, self.level).item
-                mesh = type(item.mesh)(item.mesh.vertices.detach(), item.mesh.faces)
-                objects[thing.name] = Object(mesh, thing.shape.material)
+                objects[thing.name] = Object(item.world_mesh, thing.shape.material)
         return Scene(objects) if objects else None

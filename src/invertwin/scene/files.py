@@ -250,8 +250,7 @@ def save_scene_xml(path: str | Path, scene: Scene) -> None:
     with replace_file(file) as part:
         (file.parent / "meshes").mkdir(exist_ok=True)
         for number, item in enumerate(scene.objects.values()):
-            place = file.parent / "meshes" / f"{number}.ply"
-            save_mesh(place, Mesh(item.vertices, item.mesh.faces))
+            save_mesh(file.parent / "meshes" / f"{number}.ply", item.world_mesh)
         part.write_bytes(ElementTree.tostring(root))
 
 

@@ -160,11 +160,7 @@ def trace_paths(
 
 
 def _find_specular(
-    bare: PathScene,
-    surfaces: CandidateSurfaces,
-    depth: int,
-    rays: int | None,
-    seed: int,
+    bare: PathScene, surfaces: CandidateSurfaces, depth: int, rays: int | None, seed: int
 ) -> tuple[list[SpecularPaths], float | None]:
     """Find the specular paths, and the estimated fraction of missed directions."""
     swapped = len(bare.rx) < len(bare.tx)

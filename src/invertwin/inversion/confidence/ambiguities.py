@@ -17,7 +17,7 @@ from invertwin.inversion.gauss_newton import GaussNewton
 from invertwin.inversion.metrics import pose_error, sample_surface
 from invertwin.scene import Mesh, Pose
 from invertwin.scene.remeshing import closest_points
-from invertwin.scene.scene import Object, Scene, displace
+from invertwin.scene.scene import Scene, displace
 
 REJECTION_ZSCORE = 2.33  # standard deviations: one true ambiguity in a hundred is rejected
 SAME_POSE_DISTANCE, SAME_POSE_ANGLE = 0.03, 0.1  # m and rad: closer results are one
@@ -86,10 +86,10 @@ def candidate_rotations(module: nn.Module, twin: Scene) -> Iterator[Float64[Tens
     item = twin[module.object]
     world = torch.eye(3, dtype=torch.float64)
     own = item.transform.detach()[:3, :3].T if len(free) == 3 else world
-    kept = [_world_mesh(item)]
+    kept = [item.world_mesh]
 
     def rotate_object(vector: Tensor) -> Mesh:
-        return _world_mesh(displace(item, torch.zeros(3, dtype=torch.float64), vector))
+        return displace(item, torch.zeros(3, dtype=torch.float64), vector).world_mesh
 
     for axis, name in zip(own[[1, 2, 0]], ("pitch", "yaw", "roll"), strict=True):
         if name not in free:
@@ -153,7 +153,7 @@ def are_same_poses(first: Scene, second: Scene, names: Sequence[str]) -> bool:
             # Displacement of points by the largest rotation that counts as none.
             most, moved = 0.13 * SAME_POSE_ANGLE, b.center.detach() - a.center.detach()
             placed = Mesh(a.vertices.detach() + moved, a.mesh.faces)
-            if not _surface_distance(placed, _world_mesh(b)) < most:
+            if not _surface_distance(placed, b.world_mesh) < most:
                 return False
     return True
 
@@ -194,11 +194,6 @@ def _refit(fit: Fit, number: int, rotation: Tensor) -> Fit | None:
     except InputError:  # many parameters, another loss, out of bounds
         return None
     return found
-
-
-def _world_mesh(item: Object) -> Mesh:
-    """The object's mesh in the world."""
-    return Mesh(item.vertices.detach(), item.mesh.faces)
 
 
 def _surface_distance(first: Mesh, second: Mesh) -> float:
