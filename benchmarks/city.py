@@ -283,7 +283,7 @@ def map_tile(job: tuple[City, int]) -> tuple[np.ndarray, dict[str, float]]:
     """
     (city, number), begin = job, time.process_time()
     buildings, points = city.buildings(), city.points(number)
-    low, high = (np.array(end) for end in (points[:, :2].amin(0), points[:, :2].amax(0)))
+    low, high = (end.numpy() for end in (points[:, :2].amin(0), points[:, :2].amax(0)))
     gains, links, pairs = torch.zeros(2, len(points), dtype=torch.float64), 0, 0
     to_tile = buildings.distances(low, high)
     for tx in city.transmitters(buildings):
