@@ -24,16 +24,17 @@ Each tile is a file, written atomically; the same command goes on after an inter
 - `cells_per_core_second`: cells over processor seconds of the tiles, on the two Ray nodes.
 - `efficiency`: processor seconds of the tiles over time × 2 cores of that run. Starting workers,
   handing out and other programs on the machine make it smaller. None if it was interrupted.
-- `cells_exponent`: slope of the logarithm of processor seconds over that of cells, 62 500 to 10⁶.
-- `buildings_exponent`: the same over buildings, from 562 to 9 000 on the same area with 250 000
+- `cells_exponent`: slope of the logarithm of processor seconds over that of cells, 62 500 to 10⁶ on
+  the same area.
+- `buildings_exponent`: the same over buildings, from 568 to 9 034 on the same area with 250 000
   cells: lots and footprints shrink. Required is the slope of n log n.
 - `model`: processor seconds of a tile = `link` × transmitters + `pair` × pairs of a point and a
   building of its halo; least squares over all tiles. `model.error` is the relative error of its sum
-  for the city of 9 000 buildings.
+  for the city of most buildings.
 - `longest`: longest over mean processor seconds of a tile. `memory_mb`: peak resident memory of a
   worker. `bytes`: of a job and of its result. `tasks_per_second`: empty tasks that `run_jobs` hands
-  to the two nodes. `lost_seconds`: by how much the run with the killed node took longer than its
-  processor seconds after the kill on one core.
+  to the two nodes. `recovery_seconds`: from the kill until the four tiles that were under way or
+  next were done.
 """
 
 import argparse
@@ -95,7 +96,7 @@ COUNTED = {
     "efficiency": (".2f", "processor seconds over time × 2 cores"),
     "longest": (".2f", "longest tile over the mean"),
     "memory_mb": (".0f", "peak resident memory of a worker [MB]"),
-    "lost_seconds": (".0f", "by the kill of a node, at most [s]"),
+    "recovery_seconds": (".1f", "from the kill of a node until four more tiles were done [s]"),
     "tasks_per_second": (".0f", "empty tasks of two nodes"),
 }
 
@@ -322,6 +323,10 @@ class TiledMap:
         """File of a tile; beside it is that of its cost."""
         return self.folder / f"tile_{number:06d}.npy"
 
+    def missing(self) -> list[int]:
+        """Numbers of the tiles that have no file."""
+        return [n for n in range(self.city.tiles) if not self.tile_file(n).exists()]
+
     def compute(self, engine: Engine = "processes", workers: int = 1) -> Iterator[int]:
         """Compute the tiles that are missing; yield the number of each when it is stored.
 
@@ -329,7 +334,7 @@ class TiledMap:
             engine: As of ``run_jobs``.
             workers: As of ``run_jobs``.
         """
-        missing = [n for n in range(self.city.tiles) if not self.tile_file(n).exists()]
+        missing = self.missing()
         begin, whole = time.monotonic(), len(missing) == self.city.tiles
         jobs = [(self.city, number) for number in missing]
         for place, (gains, cost) in run_jobs(map_tile, jobs, engine=engine, workers=workers):
@@ -433,26 +438,27 @@ def map_by_ray(city: City, folder: Path) -> TiledMap:
 def map_beside_kill(city: City, folder: Path) -> tuple[TiledMap, float | None]:
     """Compute a map by two nodes, and kill one after a quarter of the tiles.
 
+    Args:
+        city: The city.
+        folder: As of ``TiledMap``.
+
     Returns:
-        The map, and the seconds from the kill to the end less the processor seconds of what was
-        computed by then; None if it was computed before.
+        The map, and the seconds from the kill until the next four tiles were done; None if they
+        were done before.
     """
-    found, done, killed = TiledMap(city, folder), 0, 0.0
-    late, lost = list[int](), folder / "lost_seconds.json"
+    found, done, killed, next_tiles = TiledMap(city, folder), 0, 0.0, set[int]()
+    file = found.folder / "recovery_seconds.json"
     with two_nodes() as kill_second:
         for number in found.compute("ray"):
             done += 1
-            if killed:
-                late.append(number)
-            elif done >= city.tiles // 4:
+            if not killed and done >= city.tiles // 4:
                 kill_second()
-                killed = time.monotonic()
-        end = time.monotonic()
-    if killed:
-        costs = found.costs
-        work = sum(costs[number]["seconds"] for number in late)
-        write_text_file(lost, json.dumps(end - killed - work))
-    return found, json.loads(lost.read_text()) if lost.exists() else None
+                killed, next_tiles = time.monotonic(), set(found.missing()[:4])
+            elif number in next_tiles:
+                next_tiles.remove(number)
+                if not next_tiles:
+                    write_text_file(file, json.dumps(time.monotonic() - killed))
+    return found, json.loads(file.read_text()) if file.exists() else None
 
 
 def count_empty_tasks() -> float:
@@ -534,7 +540,7 @@ def measure(city: City, small: City, out: Path) -> dict[str, Any]:
     if find_spec("ray") is not None:
         full = map_by_ray(city, out / "ray")
         equal["ray"] = full.merge() == merged
-        killed, found["lost_seconds"] = map_beside_kill(city, out / "killed")
+        killed, found["recovery_seconds"] = map_beside_kill(city, out / "killed")
         equal["killed"] = killed.merge() == merged
         found["tasks_per_second"] = count_empty_tasks()
     seconds, wall = [cost["seconds"] for cost in full.costs], full.wall_seconds

@@ -174,8 +174,8 @@ def test_a_killed_node_changes_no_byte(city, small, tmp_path, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # of the nodes
     one = city.complete_map(small, tmp_path / "one")
-    killed, lost = city.map_beside_kill(small, tmp_path / "killed")
+    killed, seconds = city.map_beside_kill(small, tmp_path / "killed")
     assert killed.merge() == one.merge()
-    assert lost > 0
+    assert seconds > 0
     again, same = city.map_beside_kill(small, tmp_path / "killed")
-    assert (again.merge(), same) == (one.merge(), lost)
+    assert (again.merge(), same) == (one.merge(), seconds)
