@@ -78,7 +78,7 @@ REQUIRED: Required = {
 # What is required, but not reached yet, and the value that must not grow: lower it with every
 # change that lowers the value, and drop the row where the requirement holds.
 REACHED: dict[str, float] = {
-    "code_lines": 42_948,
+    "code_lines": 42_947,
 }
 
 AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef

@@ -22,6 +22,7 @@ def script(name: str) -> Any:
 basin = script("basin")
 batch = script("batch")
 channels = script("channels")
+city = script("city")
 crash_safety = script("crash_safety")
 dataset = script("dataset")
 diffraction = script("diffraction")

@@ -67,6 +67,34 @@ def test_ray_that_is_not_installed_is_told(monkeypatch):
         list(run_jobs(squared, [1], engine="ray"))
 
 
+def waited(number: int) -> tuple[int, str]:
+    time.sleep(0.5)
+    return number, os.environ["OMP_NUM_THREADS"]
+
+
+@pytest.mark.slow
+def test_pieces_of_a_killed_node_are_done_by_others(repository, monkeypatch):
+    """Runs where the extra `ray` is installed."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
+
+    paths = [str(repository / "tests"), *sys.path]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))  # of the nodes
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        second = cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False)
+        found = []
+        for number, result in run_jobs(waited, range(20, 32), engine="ray"):
+            found.append((number, result))
+            if len(found) == 4:
+                cluster.remove_node(second, allow_graceful=False)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    assert sorted(found) == [(k, (20 + k, "1")) for k in range(12)]
+
+
 def test_code_of_the_current_folder_does_not_run(tmp_path, monkeypatch):
     """Workers and the process that looks after what they share import modules of their own."""
     mark = tmp_path / "mark"
