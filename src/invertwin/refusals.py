@@ -11,7 +11,7 @@ def refusal(name: str, *values: Any, at: str = "") -> InputError:
 
     Args:
         name: Section and key of refusals.toml, such as ``rcs.part``.
-        *values: What its text leaves open.
+        values: What its text leaves open.
         at: The key of a run file that it is about.
     """
     return InputError(refusal_text(name, *values), at)
@@ -22,7 +22,7 @@ def refusal_text(name: str, *values: Any) -> str:
 
     Args:
         name: Section and key of refusals.toml, such as ``rcs.part``.
-        *values: What the text leaves open.
+        values: What the text leaves open.
     """
     section, key = name.split(".")
     return read_table("invertwin", "refusals.toml")[section][key].format(*values)

@@ -9,6 +9,7 @@ import torch
 import invertwin as iw
 from invertwin.discovery import (
     estimate_clutter,
+    finds_lobes,
     reconstruct_among_clutter,
     reconstruct_with_permittivities,
 )
@@ -143,6 +144,7 @@ def test_a_lobe_that_the_model_lacks_is_found(lobed):
     pose = Pose("letter", axes="xy", rotation_axes="z")
     found = reconstruct_among_clutter(start, observation, pose, seed=1, always=False, **FIT)
     assert found.verdict.word == "consistent"
+    assert finds_lobes(found, start)
     material, bars = vars(found.scene["letter"].material), found.uncertainty.deviations
     for name, value in (("diffuse", 0.3), ("lobe_width", math.radians(25))):
         assert abs(float(material[name]) - value) < 3 * bars[f"letter.{name}"] < 0.6
@@ -150,6 +152,20 @@ def test_a_lobe_that_the_model_lacks_is_found(lobed):
     assert float(off.norm()) < 0.02
     assert float(off[0]) < 3 * bars["letter.x"]
     assert float(off[1]) < 3 * bars["letter.y"]
+
+
+def test_lobes_that_the_data_do_not_need_are_none(recording):
+    """A matt letter has a diffuse share near 1, and lobes as wide as one likes."""
+    truth, _, observation = recording
+    points = iw.Sampling(depth=1, points_per_m2=4e3)
+    sensor, grid = observation.initial_sensor(), observation.model.grid
+    data = iw.simulate(truth, sensor, grid, seed=8, sampling=points, snr_db=20.0)
+    given = [iw.Observation(observation.model, iw.Capture.from_beat(data.beat, sensor))]
+    start = iw.Scene({"letter": letter((0.03, -0.02), 0.25), "wall": truth["wall"]})
+    pose = Pose("letter", axes="xy", rotation_axes="z")
+    found = reconstruct_with_permittivities(start, given, pose, lobes=True, seed=1, **FIT)
+    assert found.verdict.word == "consistent"
+    assert not finds_lobes(found, start)
 
 
 def test_lobes_are_those_of_rough_dielectrics(lobed):

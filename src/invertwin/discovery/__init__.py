@@ -4,6 +4,7 @@ from invertwin.deprecation import rename_attributes
 from invertwin.discovery.clutter import Clutter as Clutter
 from invertwin.discovery.clutter import choose_result as choose_result
 from invertwin.discovery.clutter import estimate_clutter as estimate_clutter
+from invertwin.discovery.clutter import finds_lobes as finds_lobes
 from invertwin.discovery.clutter import needs_clutter as needs_clutter
 from invertwin.discovery.clutter import needs_permittivities as needs_permittivities
 from invertwin.discovery.clutter import reconstruct_among_clutter as reconstruct_among_clutter

@@ -26,7 +26,7 @@ from invertwin.scene import MaterialValues, Object, Scene, signed_distance
 # Clutter of more than this share of the fitted objects' power may be echoes of these objects, such
 # as a letter with a wrong rotation.
 _RIVAL_SHARE = 0.05
-_SIGNIFICANT = 3.0  # standard deviations of a permittivity from the stated one
+_SIGNIFICANT = 3.0  # standard deviations of a material value from the stated one
 _LOG_SUSCEPTIBILITIES = -3.0, 4.0  # search for initial permittivities: 1.05 to 56
 _INITIAL_LOBE = {"diffuse": 0.5, "lobe_width": 0.5}  # [rad]; without any, its width has no effect
 _RESOLUTIONS = 2.0  # range resolutions about a fitted object that clutter leaves free, without blur
@@ -122,7 +122,7 @@ def _fit_without_clutter(
             for lobes in (False, True):
                 own = copy.deepcopy(unknowns)
                 found = reconstruct_with_permittivities(scene, given, own, lobes=lobes, **how)
-                if not needs_clutter(found):
+                if not needs_clutter(found) and (not lobes or finds_lobes(found, scene)):
                     return found
     return plain
 
@@ -181,8 +181,7 @@ def _free_materials(
         lobe: dict[str, Any] = _INITIAL_LOBE if is_known else {}
         values[f"{name}.permittivity"] = MaterialValues(name, permittivity=value, **lobe)
     fit = fit.copy(*values.values())
-    for module in values.values():
-        raw = module.raw["permittivity"]
+    for raw in [module.raw["permittivity"] for module in values.values()]:
 
         def loss(value: float, raw: Tensor = raw) -> float:
             with torch.no_grad():
@@ -193,13 +192,29 @@ def _free_materials(
     return values
 
 
+def finds_lobes(found: inversion.Reconstruction, stated: Scene) -> bool:
+    """True if a fitted diffuse share differs significantly from the stated one.
+
+    Lobes that the data do not determine would only take up other errors of the model.
+
+    Args:
+        found: result of ``reconstruct_with_permittivities`` with ``lobes``.
+        stated: initial scene.
+
+    Raises:
+        InputError: Error bars are not available.
+    """
+    shares = [name for name in found.uncertainty.names if name.endswith(".diffuse")]
+    return any(_has_moved(found, share, stated.objects) for share in shares)
+
+
 def _has_moved(found: inversion.Reconstruction, key: str, before: Mapping[str, Object]) -> bool:
-    """Test whether a fitted permittivity differs significantly from the stated one.
+    """Test whether a fitted material value differs significantly from the stated one.
 
     A value that the data do not determine would only take up clutter.
     """
-    name = key.removesuffix(".permittivity")
-    ends = (vars(objects[name].material)["permittivity"] for objects in (found.scene, before))
+    name, field = key.rsplit(".", 1)
+    ends = (vars(objects[name].material)[field] for objects in (found.scene, before))
     return bool(abs(next(ends) - next(ends)) > _SIGNIFICANT * found.uncertainty.deviations[key])
 
 
@@ -212,9 +227,8 @@ def _find_rivals(
         share = float(clutter.echoes.sum()) / _predict_power_of(fitted, scene, observation, seed)
         if share > _RIVAL_SHARE:
             place = ", ".join(f"{value:.2f}" for value in clutter.strongest_position.tolist())
-            times = f"{min(share, 999.0):.2g} times the power of the fitted objects"
-            end = f"strongest at ({place}) m: they may be parts of these"
-            yield f"unmodelled echoes have {times}, {end}"
+            power = f"{min(share, 999.0):.2g} times the power of the fitted objects, strongest at"
+            yield f"unmodelled echoes have {power} ({place}) m: they may be parts of these"
 
 
 def _predict_power_of(
@@ -320,9 +334,8 @@ def estimate_clutter(
     """
     model, radar = observation.model, observation.initial_sensor()
     if not isinstance(model, SurrogateMap):
-        raise InputError(
-            f"expected a SurrogateMap for clutter, got a {type(model).__name__}; fit without"
-        )
+        kind = type(model).__name__
+        raise InputError(f"expected a SurrogateMap for clutter, got a {kind}; fit without")
     power = observation.observed_map()
     with torch.no_grad():
         predicted = model.scale_blur(0.0).predict(scene, radar, seed).clamp_min(0.0)

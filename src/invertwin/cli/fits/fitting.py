@@ -152,13 +152,15 @@ def _fit_materials(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     if not discovery.needs_permittivities(fits.found):
         return fits
     given = fits.problem, fits.start, fits.best["start"]
-    for method in (problems.WITH_PERMITTIVITIES, problems.WITH_LOBES):
+    for method, lobes in ((problems.WITH_PERMITTIVITIES, False), (problems.WITH_LOBES, True)):
         try:
             row, outcome = run_fit(*given, method, folder, console)
+            found = outcome()
+            determined = not lobes or discovery.finds_lobes(found, fits.start.scene)
         except InputError:  # the data do not determine material values
             break
-        fits, found = replace(fits, rows={**fits.rows, method: [row]}), outcome()
-        if not discovery.needs_clutter(found):
+        fits = replace(fits, rows={**fits.rows, method: [row]})
+        if determined and not discovery.needs_clutter(found):
             return replace(fits, best=row, found=found)
     return fits
 

@@ -242,10 +242,8 @@ def _make_screening_loss(
     observations: Sequence[Observation], loss: Callable[[Tensor, Tensor], Tensor] | None, seed: int
 ) -> Callable[[Candidate], float]:
     """The loss of a candidate at the widest blur."""
-    objective = Objective(
-        tuple(resolve_loss(o.model, o.loss or loss) for o in observations),
-        tuple(o.weight for o in observations),
-    )
+    losses = tuple(resolve_loss(o.model, o.loss or loss) for o in observations)
+    objective = Objective(losses, tuple(o.weight for o in observations))
     blurred = [o.model.blur_observed(o.observed_map(), o.sensor) for o in observations]
     models = [_reduce_samples(o.model) for o in observations]
 
@@ -295,6 +293,5 @@ def _are_near(first: Candidate, second: Candidate, names: Sequence[str]) -> bool
     if not names:
         return first.group is not None and first.group == second.group
     offs = [pose_error(first.scene[name], second.scene[name]) for name in names]
-    return all(
-        o and o.distance < _SAME_START_DISTANCE and o.angle < _SAME_START_ANGLE for o in offs
-    )
+    near = (o and o.distance < _SAME_START_DISTANCE and o.angle < _SAME_START_ANGLE for o in offs)
+    return all(near)
