@@ -72,8 +72,7 @@ def run_twin(arguments: TwinOptions, folder: RunFolder) -> tuple[list[report.Rep
         explained = found.observed.double().log() - found.predicted.double().log()
         metrics["residual_log_std"] = float(explained.std())
     if truth is not None and scene is not None:
-        both = scene.objects.values(), truth.objects.values()
-        whole = [merge_meshes([item.world_mesh for item in items]) for items in both]
+        whole = [merge_meshes([o.world_mesh for o in s.objects.values()]) for s in (scene, truth)]
         metrics["chamfer_m"] = compare_shapes(*whole, voxel=None).chamfer
         metrics["true_count"] = len(truth.names)
     metrics["wall_seconds"] = time.perf_counter() - begin

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -155,13 +156,13 @@ def _fit_materials(fits: Fits, folder: RunFolder, console: Console) -> Fits:
     for method, lobes in ((problems.WITH_PERMITTIVITIES, False), (problems.WITH_LOBES, True)):
         try:
             row, outcome = run_fit(*given, method, folder, console)
-            found = outcome()
-            determined = not lobes or discovery.finds_lobes(found, fits.start.scene)
         except InputError:  # the data do not determine material values
             break
-        fits = replace(fits, rows={**fits.rows, method: [row]})
-        if determined and not discovery.needs_clutter(found):
-            return replace(fits, best=row, found=found)
+        fits, found = replace(fits, rows={**fits.rows, method: [row]}), outcome()
+        with suppress(InputError):  # error bars may not be available
+            determined = not lobes or discovery.finds_lobes(found, fits.start.scene)
+            if determined and not discovery.needs_clutter(found):
+                return replace(fits, best=row, found=found)
     return fits
 
 
